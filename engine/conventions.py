@@ -1,0 +1,76 @@
+"""The conventions of hostlens; every other module imports them from here.
+
+*Sky frame*: x to the East, y to the North, arcsec; position angles in degrees East of North. Catalogues and
+specifications use it.
+
+*Image frame*: x along increasing pixel columns, y along increasing pixel rows, arcsec, origin at the centre of the
+image; angles in radians counter-clockwise from +x. Images are North up, East left, so ``x_image = -x_East``. All
+numeric modules use it; :mod:`engine.scene` is the one place that converts.
+
+Einstein radii and half-light radii are on the intermediate axis, ``R = sqrt(q x^2 + y^2 / q)`` with x along the major
+axis; magnitudes are AB; surface brightness is in e-/s per pixel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def image_angle(position_angle_deg: float) -> float:
+    """Angle in the image frame [rad] of a position angle [deg East of North].
+
+    East of North means towards -x in an image with East to the left: phi = PA + 90 deg.
+    """
+    return math.remainder(math.radians(position_angle_deg + 90.0), math.pi)
+
+
+def position_angle(phi: float) -> float:
+    """Position angle [deg East of North, in 0..180] of an image-frame angle [rad]."""
+    return (math.degrees(phi) - 90.0) % 180.0
+
+
+def sky_to_image(position: tuple[float, float]) -> tuple[float, float]:
+    """Image-frame position of a sky-frame one [arcsec]; its own inverse."""
+    return -position[0], position[1]
+
+
+def sky_to_image_shear(shear: tuple[float, float]) -> tuple[float, float]:
+    """Image-frame shear (gamma1, gamma2) of a sky-frame one; mirroring x flips the sign of gamma2."""
+    return shear[0], -shear[1]
+
+
+def magnitude_to_rate(magnitude: float, zero_point: float) -> float:
+    """Count rate [e-/s] of an AB magnitude."""
+    return float(10.0 ** (0.4 * (zero_point - magnitude)))
+
+
+def rate_to_magnitude(rate: float, zero_point: float) -> float:
+    """AB magnitude of a count rate [e-/s], which must be positive."""
+    if not rate > 0:
+        raise ValueError(f"rate: got {rate!r}, allowed is a positive count rate")
+    return zero_point - 2.5 * math.log10(rate)
+
+
+def paper_einstein_radius(theta_E: float, q: float, slope: float) -> float:
+    """R_E of the paper's eq. (2) from the intermediate-axis theta_E [arcsec].
+
+    Equating kappa = (2-eta)/2 (theta_E / sqrt(q x^2 + y^2/q))^eta with eq. (2), whose prefactor is
+    (2-eta)/(1+q) and whose radius is sqrt(x^2 + y^2/q^2), gives R_E = theta_E q^(-1/2) ((1+q)/2)^(1/eta).
+    """
+    eta = slope - 1.0
+    return float(theta_E * q**-0.5 * ((1.0 + q) / 2.0) ** (1.0 / eta))
+
+
+def intermediate_einstein_radius(paper_radius: float, q: float, slope: float) -> float:
+    """Intermediate-axis theta_E [arcsec] from R_E of the paper's eq. (2)."""
+    return float(paper_radius / paper_einstein_radius(1.0, q, slope))
+
+
+def pixel_centres(n: int, scale: float) -> FloatArray:
+    """Coordinates [arcsec] of the centres of n pixels along one axis, with the origin at the middle of the axis."""
+    return (np.arange(n, dtype=np.float64) - (n - 1) / 2.0) * scale

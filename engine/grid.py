@@ -1,0 +1,137 @@
+"""Grids of realizations: the paper's Table 2 with the numbering of Table 3, cut as wanted, or a grid of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Annotated
+
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from engine.catalogue import load_system, read_catalogue
+from engine.errors import SpecError
+from engine.spec import Analysis, Host, Identifier, Magnitude, NoiseLevel, Radius, Realization, SersicIndex
+
+PAPER = "h0licow-vi"
+_STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class Grid:
+    """A request for realizations.
+
+    With ``preset`` (``h0licow-vi`` for all eight systems, ``h0licow-vi/HE0435`` for one) the values are those of the
+    paper's Table 2, and n, r_eff, magnitude, l_eta cut them: each must then be a subset of the preset's values.
+    Without it, ``systems`` and all four lists of values must be given and every combination is run. ``replicates``
+    repeats each point with seeds seed, seed + 1, ...
+    """
+
+    preset: Identifier | None = None
+    systems: tuple[Identifier, ...] | None = None
+    n: tuple[SersicIndex, ...] | None = None
+    r_eff: tuple[Radius, ...] | None = None
+    magnitude: tuple[Magnitude, ...] | None = None
+    l_eta: tuple[float, ...] | None = None
+    mass_model: Identifier = "recommended"
+    noise_level: NoiseLevel = "author"
+    seed: Annotated[int, Field(ge=0, le=2**62)] = 0
+    replicates: Annotated[int, Field(ge=1, le=100_000)] = 1
+    analysis: Analysis = Field(default_factory=Analysis)
+
+
+@dataclass(frozen=True, config=_STRICT)
+class GridRun:
+    """One run of a grid: its label within the grid, the paper's run number (1-48) where it has one, and the spec."""
+
+    label: str
+    paper_run: int | None
+    realization: Realization
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the presets: the paper's whole study, and each of its systems."""
+    return (PAPER, *(f"{PAPER}/{name}" for name in read_catalogue("h0licow_vi")["systems"]))
+
+
+def expand(grid: Grid) -> tuple[GridRun, ...]:
+    """All runs of a grid in a fixed order; a SpecError says which value is not allowed and what is."""
+    points = _paper_points(grid) if grid.preset is not None else _free_points(grid)
+    runs = []
+    for (system, number, host, l_eta), replicate in product(points, range(grid.replicates)):
+        load_system(system).mass_model(grid.mass_model, l_eta)
+        realization = Realization(
+            system=system,
+            l_eta=l_eta,
+            host=host,
+            seed=grid.seed + replicate,
+            noise_level=grid.noise_level,
+            mass_model=grid.mass_model,
+            analysis=grid.analysis,
+        )
+        name = f"{number:02d}" if number is not None else f"n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{l_eta:g}"
+        suffix = f"#{replicate + 1}" if grid.replicates > 1 else ""
+        runs.append(GridRun(label=f"{system}/{name}{suffix}", paper_run=number, realization=realization))
+    return tuple(runs)
+
+
+_Point = tuple[str, int | None, Host, float]
+
+
+def _paper_points(grid: Grid) -> list[_Point]:
+    table = read_catalogue("h0licow_vi")
+    if grid.preset not in preset_names():
+        raise SpecError("preset", grid.preset, f"one of {list(preset_names())}")
+    _, _, only = grid.preset.partition("/")
+    names = [only] if only else list(table["systems"])
+    if grid.systems is not None:
+        _require_subset("systems", grid.systems, names)
+        names = [name for name in names if name in grid.systems]
+    serials = {entry["serial"]: entry for entry in table["serials"]}
+    known = {
+        "n": {float(entry["n"]) for entry in serials.values()},
+        "l_eta": {float(entry["l_eta"]) for entry in serials.values()},
+        "r_eff": {float(r) for name in names for r in table["systems"][name]["r_eff"].values()},
+        "magnitude": {float(m) for name in names for m in table["systems"][name]["magnitude"]},
+    }
+    for field, values in known.items():
+        _require_subset(field, getattr(grid, field), sorted(values))
+    points: list[_Point] = []
+    for name in names:
+        values = table["systems"][name]
+        for number, serial, rank in table["runs"]:
+            entry = serials[serial]
+            n, l_eta = float(entry["n"]), float(entry["l_eta"])
+            r_eff, magnitude = float(values["r_eff"][entry["r_eff"]]), float(values["magnitude"][rank - 1])
+            cuts = ((n, grid.n), (l_eta, grid.l_eta), (r_eff, grid.r_eff), (magnitude, grid.magnitude))
+            if all(wanted is None or value in wanted for value, wanted in cuts):
+                points.append((name, number, Host(n=n, r_eff=r_eff, magnitude=magnitude), l_eta))
+    if not points:
+        raise SpecError("grid", "no run left", "cuts that leave at least one of the preset's runs")
+    return points
+
+
+def _free_points(grid: Grid) -> list[_Point]:
+    for field in ("systems", "n", "r_eff", "magnitude", "l_eta"):
+        if not getattr(grid, field):
+            raise SpecError(field, getattr(grid, field), "a non-empty list where no preset is given")
+    systems, n, r_eff, magnitude, l_eta = grid.systems, grid.n, grid.r_eff, grid.magnitude, grid.l_eta
+    if systems is None or n is None or r_eff is None or magnitude is None or l_eta is None:
+        raise AssertionError("checked above")
+    for field in ("systems", "n", "r_eff", "magnitude", "l_eta"):
+        if len(set(getattr(grid, field))) != len(getattr(grid, field)):
+            raise SpecError(field, getattr(grid, field), "a list without repeated values")
+    return [
+        (system, None, Host(n=index, r_eff=radius, magnitude=brightness), slope)
+        for system, slope, radius, index, brightness in product(systems, l_eta, r_eff, n, magnitude)
+    ]
+
+
+def _require_subset(field: str, values: Sequence[object] | None, allowed: Sequence[object]) -> None:
+    if values is None:
+        return
+    if not values:
+        raise SpecError(field, values, f"a non-empty subset of {list(allowed)}")
+    for value in values:
+        if value not in allowed:
+            raise SpecError(field, value, f"one of {list(allowed)} in this preset")

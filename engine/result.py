@@ -1,0 +1,143 @@
+"""What a run returns: typed numbers for the database, and arrays for figures and files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from engine.conventions import FloatArray
+
+EstimatorName = Literal["paper", "projected"]
+IndexPrior = Literal["free", "fixed"]
+ChainStatus = Literal["converged", "not_converged"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A recovered quantity: mean and standard deviation over the draws, the truth where there is one."""
+
+    mean: float
+    sd: float
+    truth: float | None = None
+
+    @property
+    def bias(self) -> float | None:
+        """Recovered mean minus truth, None without a truth."""
+        return None if self.truth is None else self.mean - self.truth
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One estimator's answer: total magnitude, r_eff [arcsec], n, q, position angle [deg], over ``draws`` draws.
+
+    ``at_bound`` counts the draws whose fit ended at a bound of a parameter; ``failed`` those whose fit did not
+    converge and which are left out of the means.
+    """
+
+    estimator: EstimatorName
+    index_prior: IndexPrior
+    magnitude: Quantity
+    r_eff: Quantity
+    n: Quantity
+    q: Quantity
+    position_angle: Quantity
+    draws: int
+    at_bound: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class LensParameter:
+    """Posterior of one lens parameter (theta_E, q, phi, slope, x, y, gamma1, gamma2, ln_lambda)."""
+
+    name: str
+    value: Quantity
+
+
+@dataclass(frozen=True)
+class ChainSummary:
+    """How well the posterior is sampled.
+
+    ``tau`` is the integrated autocorrelation time in steps, largest over the parameters; ``effective_samples`` the
+    number of independent samples that it leaves.
+    """
+
+    status: ChainStatus
+    walkers: int
+    steps: int
+    burn_in: int
+    tau: float
+    effective_samples: float
+    acceptance: float
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """Wall and CPU seconds of one stage of the run."""
+
+    stage: str
+    wall_s: float
+    cpu_s: float
+
+
+@dataclass(frozen=True)
+class Products:
+    """Arrays of a run: image-plane maps on the drizzled grid, source-plane maps on the source grid.
+
+    ``image``, ``model``, ``residual`` (normalised) are (ny, nx) in e-/s and sigma; ``mask`` is True where fitted;
+    ``source``, ``source_truth`` and ``source_sd`` are (ny, nx) in e-/s per arcsec^2 over ``source_extent``
+    (left, right, bottom, top) [arcsec]; ``draws`` is (draws, ny, nx); ``chain`` is (samples, parameters) in the
+    order of ``parameter_names``.
+    """
+
+    image: FloatArray
+    noise: FloatArray
+    model: FloatArray
+    arc_model: FloatArray
+    residual: FloatArray
+    mask: FloatArray
+    pixel_scale: float
+    source: FloatArray
+    source_sd: FloatArray
+    source_truth: FloatArray | None
+    source_extent: tuple[float, float, float, float]
+    chain: FloatArray
+    parameter_names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """The outcome of one run.
+
+    ``arc_magnitude`` is the AB magnitude of the lensed host in the image plane, ``agn_contrast`` AGN minus arc
+    magnitude, ``surface_brightness`` the host's mean surface brightness inside r_eff [mag arcsec^-2] (the paper's
+    section 5).
+    """
+
+    realization_digest: str
+    engine_digest: str
+    versions: dict[str, str]
+    seed: int
+    noise_level: str
+    noise_treatment: str
+    estimates: tuple[Estimate, ...]
+    lens: tuple[LensParameter, ...]
+    chain: ChainSummary
+    ln_evidence: float
+    chi2: float
+    degrees_of_freedom: int
+    condition_number: float
+    arc_magnitude: float
+    agn_contrast: float | None
+    surface_brightness: float
+    stages: tuple[StageTime, ...]
+    warnings: tuple[str, ...] = ()
+    products: Products | None = field(default=None, repr=False, compare=False)
+
+    def estimate(self, estimator: EstimatorName, index_prior: IndexPrior) -> Estimate:
+        """The answer of one estimator; KeyError where the run has none."""
+        for found in self.estimates:
+            if (found.estimator, found.index_prior) == (estimator, index_prior):
+                return found
+        raise KeyError((estimator, index_prior))
