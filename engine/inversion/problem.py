@@ -1,0 +1,130 @@
+"""From an observation and its parametric model to the linear problem: mask, noise, amplitude columns, rays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from engine.conventions import FloatArray, pixel_centres
+from engine.errors import ObservationError
+from engine.imaging.observation import Observation
+from engine.inversion.blurring import blur, central_stamp, pixel_kernel, point_source_column
+from engine.inversion.mapping import cast_rays
+from engine.inversion.operator import LinearData, Operator, build_operator
+from engine.light.rendering import render_sersic
+from engine.modelling.parametric import ParametricFit
+from engine.spec import Analysis
+
+CORE_BOOST = 1e3
+"""Factor on the standard deviation of the pixels at the AGN cores: 'effectively infinite' (section 4.1)."""
+
+_PAPER_CODE_FACTOR = 0.01
+"""The paper's scripts wrote sqrt(rms^2 + 0.01 |image|) as the noise map."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The linear problem of an observation.
+
+    ``mask`` and ``core`` are (ny, nx): the fitted ring, and the pixels in it whose noise is boosted;
+    ``amplitude_names`` are those of the operator's columns and ``amplitude_images`` (k, ny, nx) their full images.
+    """
+
+    operator: Operator
+    mask: NDArray[np.bool_]
+    core: NDArray[np.bool_]
+    amplitude_names: tuple[str, ...]
+    amplitude_images: FloatArray
+
+
+def ring_mask(
+    shape: tuple[int, int], pixel_scale: float, centre: tuple[float, float], inner: float, outer: float
+) -> NDArray[np.bool_]:
+    """Pixels (ny, nx) whose centres lie between two radii [arcsec] of a centre [arcsec, image frame]."""
+    y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in shape), indexing="ij")
+    radius = np.hypot(x - centre[0], y - centre[1])
+    return np.asarray((radius >= inner) & (radius <= outer))
+
+
+def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tuple[str, ...], FloatArray]:
+    ny, nx = observation.image.shape
+    scale = observation.pixel_scale
+    names, images = [], []
+    for k, agn in enumerate(fit.agn):
+        names.append(f"agn{k + 1}")
+        images.append(
+            point_source_column(
+                observation.psf, (ny, nx), agn.x / scale + (nx - 1) / 2.0, agn.y / scale + (ny - 1) / 2.0
+            )
+        )
+    if fit.deflector is not None:
+        light = render_sersic(fit.deflector, pixel_centres(nx, scale), pixel_centres(ny, scale), scale)
+        names.append("deflector")
+        images.append(blur(light, pixel_kernel(observation.psf, None)) / fit.deflector.flux)
+    names.append("background")
+    images.append(np.ones((ny, nx)))
+    return tuple(names), np.stack(images)
+
+
+def _noise(
+    observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
+) -> FloatArray:
+    """Variances (M,) or covariance (M, M) of the data on the mask under the chosen treatment, cores boosted."""
+    variance = observation.noise[mask] ** 2
+    boost = np.where(core[mask], variance * CORE_BOOST**2, 0.0)
+    if analysis.noise_treatment == "covariance":
+        if observation.covariance is None:
+            raise ObservationError(
+                "noise_treatment: got 'covariance', but the observation has no covariance; "
+                "allowed is 'diagonal' or 'paper_code'"
+            )
+        chosen = np.flatnonzero(mask)
+        covariance = observation.covariance.tocsr()[chosen][:, chosen].toarray()
+        covariance[np.diag_indices_from(covariance)] += boost
+        return np.asarray(covariance)
+    if analysis.noise_treatment == "paper_code":
+        variance = variance + _PAPER_CODE_FACTOR * np.abs(observation.image[mask])
+    return np.asarray(variance + boost)
+
+
+def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Analysis) -> Problem:
+    """Lay out the linear problem.
+
+    The ring is centred on the fitted lens and scaled by its Einstein radius; it then stays fixed.
+
+    Raises
+    ------
+    ObservationError
+        The ring holds no valid pixel, or the covariance that is asked for is not there.
+    """
+    shape, scale = observation.image.shape, observation.pixel_scale
+    theta_E = fit.lens.theta_E
+    ring = ring_mask(
+        shape, scale, (fit.lens.x, fit.lens.y), analysis.mask_inner * theta_E, analysis.mask_outer * theta_E
+    )
+    mask = ring & observation.valid
+    if not mask.any():
+        raise ObservationError(
+            f"mask: a ring of {analysis.mask_inner * theta_E:.2f}-{analysis.mask_outer * theta_E:.2f} arcsec "
+            "holds no valid pixel"
+        )
+    core = np.zeros(shape, dtype=np.bool_)
+    for agn in fit.agn:
+        core |= ring_mask(shape, scale, (agn.x, agn.y), 0.0, analysis.core_radius)
+    core &= mask
+    names, images = _amplitude_images(observation, fit)
+    margin = distance_transform_edt(~mask) <= analysis.ray_margin
+    rays = cast_rays(
+        mask, margin, pixel_centres(shape[1], scale), pixel_centres(shape[0], scale), scale, analysis.subrays
+    )
+    linear = LinearData(
+        data=observation.image[mask],
+        covariance=_noise(observation, analysis, mask, core),
+        columns=np.ascontiguousarray(images[:, mask].T),
+    )
+    kernel = pixel_kernel(central_stamp(observation.psf, analysis.psf_radius), analysis.subrays)
+    operator = build_operator(linear, kernel, rays, np.nonzero(mask), np.nonzero(mask | margin))
+    return Problem(operator=operator, mask=mask, core=core, amplitude_names=names, amplitude_images=images)

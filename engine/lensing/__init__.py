@@ -1,0 +1,1 @@
+"""Gravitational lensing by an elliptical power law with external shear: deflection, magnification, images."""

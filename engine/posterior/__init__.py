@@ -1,0 +1,1 @@
+"""The posterior of lens and regularisation: target (:mod:`.target`), optimum (:mod:`.optimum`), chain (:mod:`.chain`)."""

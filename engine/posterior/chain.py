@@ -1,0 +1,146 @@
+"""The chain: emcee over lens parameters and ln lambda, with proposals from the Gaussian approximation.
+
+Two moves share the work. The independence move proposes from a multivariate t distribution with the mean and
+covariance of the Gaussian approximation (re-estimated from the burn-in): where that approximation is good, successive
+states are nearly independent. The differential-evolution move follows whatever shape the walkers have found. Both
+leave the exact posterior invariant, so a poor approximation costs acceptance, not correctness.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+
+from engine.conventions import FloatArray
+from engine.errors import PosteriorError
+from engine.posterior.optimum import Laplace
+from engine.posterior.target import Target
+from engine.result import ChainStatus, ChainSummary
+
+_FREEDOM = 5.0
+_INDEPENDENCE_SHARE = 0.7
+_BURN_IN = 12
+_CHUNK = 10
+AUTOCORRELATION_TIMES = 50.0
+"""A chain shorter than this many autocorrelation times is not called converged (emcee's own rule)."""
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Samples after burn-in, (steps, walkers, parameters), their ln posterior (steps, walkers), and the summary."""
+
+    samples: FloatArray
+    ln_posterior: FloatArray
+    summary: ChainSummary
+
+    def flat(self) -> FloatArray:
+        """All samples, (steps * walkers, parameters)."""
+        return self.samples.reshape(-1, self.samples.shape[-1])
+
+    def thinned(self, number: int, rng: np.random.Generator) -> FloatArray:
+        """``number`` states as far apart in steps as the chain allows, from walkers in random order."""
+        steps, walkers, _ = self.samples.shape
+        at = np.linspace(0, steps - 1, min(number, steps)).round().astype(int)
+        rounds = -(-number // at.size)
+        order = np.concatenate([rng.permutation(walkers) for _ in range(-(-number // walkers))])[:number]
+        return np.asarray(self.samples[np.tile(at, rounds)[:number], order])
+
+
+class _IndependenceProposal:
+    """Multivariate t proposals that do not depend on the present state; emcee's proposal-function protocol."""
+
+    def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
+        self.update(mean, covariance)
+
+    def update(self, mean: FloatArray, covariance: FloatArray) -> None:
+        self.mean = mean
+        self.root = np.linalg.cholesky(covariance)
+        self.inverse = np.linalg.inv(self.root)
+
+    def _ln_density(self, values: FloatArray) -> FloatArray:
+        z2 = (((values - self.mean) @ self.inverse.T) ** 2).sum(axis=1)
+        return np.asarray(-0.5 * (_FREEDOM + self.mean.size) * np.log1p(z2 / _FREEDOM))
+
+    def draw(self, size: int, random: np.random.RandomState) -> FloatArray:
+        normal = random.standard_normal((size, self.mean.size))
+        scale = np.sqrt(_FREEDOM / random.chisquare(_FREEDOM, size))
+        return np.asarray(self.mean + (normal * scale[:, None]) @ self.root.T)
+
+    def __call__(self, states: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
+        proposed = self.draw(states.shape[0], random)
+        return proposed, self._ln_density(states) - self._ln_density(proposed)
+
+
+def _start(target: Target, proposal: _IndependenceProposal, walkers: int, random: np.random.RandomState) -> FloatArray:
+    states: list[FloatArray] = []
+    for _ in range(50):
+        for values in proposal.draw(walkers, random):
+            if target.prior.holds(values):
+                states.append(values)
+            if len(states) == walkers:
+                return np.array(states)
+    raise PosteriorError("chain: the Gaussian approximation lies outside the prior")
+
+
+def autocorrelation_time(samples: FloatArray) -> float:
+    """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters)."""
+    times = emcee.autocorr.integrated_time(samples, quiet=True, has_walkers=True)
+    return float(np.max(times)) if np.all(np.isfinite(times)) else math.inf
+
+
+def run_chain(
+    target: Target,
+    laplace: Laplace,
+    *,
+    walkers: int,
+    max_steps: int,
+    rng: np.random.Generator,
+    progress: Callable[[float], None] | None = None,
+) -> Chain:
+    """Sample the target until the chain is 50 autocorrelation times long, or ``max_steps`` are spent.
+
+    Raises
+    ------
+    PosteriorError
+        No walker finds a place inside the prior.
+    """
+    random = np.random.RandomState(int(rng.integers(2**32)))
+    proposal = _IndependenceProposal(laplace.mean, laplace.covariance)
+    moves = [
+        (emcee.moves.MHMove(proposal), _INDEPENDENCE_SHARE),
+        (emcee.moves.DEMove(), 1.0 - _INDEPENDENCE_SHARE),
+    ]
+    sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, target, moves=moves)
+    state = emcee.State(_start(target, proposal, walkers, random), random_state=random.get_state())
+    state = sampler.run_mcmc(state, _BURN_IN, skip_initial_state_check=True)
+    burnt = sampler.get_chain(discard=_BURN_IN // 2, flat=True)
+    proposal.update(burnt.mean(axis=0), _blend(np.cov(burnt.T), laplace.covariance))
+    sampler.reset()
+    tau, steps = math.inf, 0
+    while steps < max_steps and steps < AUTOCORRELATION_TIMES * tau:
+        state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
+        steps = sampler.iteration
+        tau = autocorrelation_time(sampler.get_chain())
+        if progress is not None:
+            progress(min(1.0, steps / min(max_steps, AUTOCORRELATION_TIMES * tau)))
+    status: ChainStatus = "converged" if steps >= AUTOCORRELATION_TIMES * tau else "not_converged"
+    summary = ChainSummary(
+        status=status,
+        walkers=walkers,
+        steps=steps,
+        burn_in=_BURN_IN,
+        tau=tau,
+        effective_samples=steps * walkers / tau,
+        acceptance=float(np.mean(sampler.acceptance_fraction)),
+        evaluations=target.evaluations,
+    )
+    return Chain(sampler.get_chain(), sampler.get_log_prob(), summary)
+
+
+def _blend(sample: FloatArray, laplace: FloatArray) -> FloatArray:
+    """Covariance for the proposal: what the burn-in shows, kept positive definite by a share of the approximation."""
+    return np.asarray(0.9 * sample + 0.1 * laplace)

@@ -1,0 +1,126 @@
+"""The maximum of the posterior and its Gaussian approximation, by Newton steps on a measured quadratic model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from engine.conventions import FloatArray
+from engine.errors import PosteriorError
+from engine.lensing.power_law import PowerLawLens
+from engine.posterior.target import Target
+
+_MAX_ROUNDS = 12
+_MAX_STEP = 4.0
+_STRENGTH_SD = 0.3
+
+
+@dataclass(frozen=True)
+class Laplace:
+    """Maximum and covariance of the Gaussian that matches the curvature there."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    ln_posterior: float
+    rounds: int
+
+
+def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, high: float = 20.0) -> float:
+    """ln lambda that maximises the evidence of a lens, to 0.01, by Brent's method between ``low`` and ``high``.
+
+    Raises
+    ------
+    PosteriorError
+        The maximum lies at an end of the interval.
+    """
+    low, high = max(low, float(target.prior.low[-1])), min(high, float(target.prior.high[-1]))
+    grid = np.linspace(low, high, 13)[1:-1]
+    values = [target(target.vector(lens, float(s))) for s in grid]
+    best = int(np.argmax(values))
+    if not math.isfinite(values[best]) or best in (0, grid.size - 1):
+        raise PosteriorError(
+            f"ln lambda: no maximum of the evidence between {low:.1f} and {high:.1f} for {lens}"
+        )
+    found = minimize_scalar(
+        lambda s: -target(target.vector(lens, float(s))),
+        bounds=(grid[best - 1], grid[best + 1]),
+        method="bounded",
+        options={"xatol": 0.01},
+    )
+    return float(found.x)
+
+
+def _quadratic_model(
+    target: Target, centre: FloatArray, value: float, root: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gradient and Hessian of the target in the coordinates z of centre + root z, from steps of one."""
+    d = centre.size
+    forward = np.array([target(centre + root[:, i]) for i in range(d)])
+    backward = np.array([target(centre - root[:, i]) for i in range(d)])
+    usable = np.isfinite(forward) & np.isfinite(backward)
+    gradient = np.where(usable, 0.5 * (forward - backward), 0.0)
+    hessian = np.diag(np.where(usable, forward - 2.0 * value + backward, -1.0))
+    for i in range(d):
+        for j in range(i):
+            if usable[i] and usable[j]:
+                both = target(centre + root[:, i] + root[:, j])
+                if math.isfinite(both):
+                    hessian[i, j] = hessian[j, i] = both - forward[i] - forward[j] + value
+    return gradient, hessian
+
+
+def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> Laplace:
+    """Climb from ``start`` with steps scaled by ``covariance`` (of the parameters, ln lambda included).
+
+    Each round measures gradient and Hessian over one standard deviation (so that roughness of the evidence below that
+    scale does not mislead), takes the Newton step of a negative definite version, shortened until it climbs, and
+    rescales the coordinates. It ends when the predicted gain is below 0.02.
+
+    Raises
+    ------
+    PosteriorError
+        The posterior is not finite at the start.
+    """
+    mean = start.copy()
+    value = target(mean)
+    if not math.isfinite(value):
+        raise PosteriorError(f"start {dict(zip(target.prior.names, start.tolist(), strict=True))}: posterior not finite")
+    root = np.linalg.cholesky(covariance)
+    for done in range(1, _MAX_ROUNDS + 1):
+        gradient, hessian = _quadratic_model(target, mean, value, root)
+        eigenvalues, vectors = np.linalg.eigh(hessian)
+        curvature = np.clip(np.abs(eigenvalues), 0.05, None)
+        projected = vectors.T @ gradient
+        step = vectors @ (projected / curvature)
+        gain = 0.5 * float((projected**2 / curvature).sum())
+        length = float(np.abs(step).max())
+        step *= min(1.0, _MAX_STEP / max(length, 1e-300))
+        trial = -math.inf
+        for _ in range(6):
+            candidate = mean + root @ step
+            trial = target(candidate)
+            if trial > value:
+                mean, value = candidate, trial
+                break
+            step *= 0.4
+        root = root @ (vectors / np.sqrt(curvature)) @ vectors.T
+        root = np.linalg.cholesky(root @ root.T)
+        if gain < 0.02 or (not trial > value and gain < 0.5):
+            break
+    return Laplace(mean, root @ root.T, value, done)
+
+
+def start_covariance(lens_covariance: FloatArray, inflation: float = 4.0) -> FloatArray:
+    """Covariance of all parameters for :func:`find_optimum`, from that of the lens parameters of the parametric fit.
+
+    Inflated, because the inversion lets the source be anything; ln lambda gets a spread of its own.
+    """
+    d = lens_covariance.shape[0]
+    out = np.zeros((d + 1, d + 1))
+    out[:d, :d] = inflation * 0.5 * (lens_covariance + lens_covariance.T)
+    out[np.arange(d), np.arange(d)] *= 1.0 + 1e-6
+    out[d, d] = _STRENGTH_SD**2
+    return out
