@@ -1,0 +1,1 @@
+"""Imaging: telescope PSF, dithered exposures and their noise, drizzle, and the observation that comes out."""

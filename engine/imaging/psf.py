@@ -1,0 +1,205 @@
+"""The point-spread function: polychromatic diffraction through the pupil, and the detector on top of it.
+
+Two arrays are told apart. The *optical* PSF is point-sampled: the irradiance at the centre of each sub-pixel
+times the sub-pixel's area. It is band-limited and sampled above its Nyquist rate, so convolving it with an
+image that is already integrated over the sub-pixels gives the blurred image integrated over the sub-pixels,
+exactly; a point source is integrated over the sub-pixels where it is placed
+(:func:`engine.imaging.blurring.point_source_image`). The *effective* PSF is what a native pixel measures: the
+optical one integrated over the pixel and spread by the detector kernel, sampled at the sub-pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from scipy import fft
+from threadpoolctl import threadpool_limits
+
+from engine.conventions import FloatArray
+from engine.errors import ObservationError, SpecError
+from engine.imaging.pupil import pupil_transmission, pupil_wavefront
+from engine.spec import Camera
+
+PUPIL_PIXELS = 512
+_NM_TO_ARCSEC = 1e-9 * math.degrees(1.0) * 3600.0
+
+
+@lru_cache(maxsize=32)
+def telescope_psf(
+    camera: Camera,
+    *,
+    oversampling: int | None = None,
+    field_of_view: float = 10.4,
+    defocus_nm: float = 0.0,
+    jitter: float = 0.0,
+    pupil_pixels: int = PUPIL_PIXELS,
+) -> FloatArray:
+    """Optical PSF of a camera over its band, sampled at pixel_scale / oversampling.
+
+    Fraunhofer diffraction by poppy's matrix Fourier transform (Soummer et al. 2007), wavelength by
+    wavelength, weighted by throughput x wavelength interval (photons of a source of equal photon rate per
+    nm).
+
+    Parameters
+    ----------
+    camera
+        Pupil, band pass and pixel scale.
+    oversampling
+        Sub-pixels along a native pixel; the camera's own where None.
+    field_of_view
+        Side of the stamp [arcsec]; rounded to the nearest odd number of sub-pixels.
+    defocus_nm, jitter
+        Focus error [nm rms of wavefront] and Gaussian pointing jitter [arcsec rms per axis].
+    pupil_pixels
+        Grid across the primary mirror; a knob of accuracy against time.
+
+    Returns
+    -------
+    Read-only odd square array, irradiance x sub-pixel area (not integrated over the sub-pixel), centred
+    exactly on its middle element. Its sum is the fraction of the light through the pupil that falls inside
+    the stamp: nothing is renormalised. Computed on one thread, kept in memory per set of arguments.
+
+    Raises
+    ------
+    SpecError
+        Where the sub-pixels do not sample the shortest wavelength (they must be below lambda / 2D).
+    """
+    factor = camera.oversampling if oversampling is None else oversampling
+    scale = camera.pixel_scale / factor
+    size = 2 * round((field_of_view / scale - 1) / 2) + 1
+    diameter_nm = camera.pupil.primary_diameter_m * 1e9
+    nyquist = min(camera.wavelength_nm) / diameter_nm * _NM_TO_ARCSEC * 1e9 / 2
+    if scale > nyquist or size < 3:
+        raise SpecError(
+            "oversampling", factor, f"sub-pixels below {nyquist:.4f} arcsec and a stamp of at least 3"
+        )
+    amplitude = pupil_transmission(camera.pupil, pupil_pixels)
+    wavefront = pupil_wavefront(camera.pupil, pupil_pixels, defocus_nm=defocus_nm)
+    # The open area, not the sum of squares, is the power: a pupil pixel that is half open lets half the light
+    # pass. So normalised, the peak converges much faster with the number of pupil pixels.
+    amplitude /= math.sqrt(np.sum(amplitude))
+    weights = np.asarray(camera.throughput) * np.gradient(np.asarray(camera.wavelength_nm))
+    psf = np.zeros((size, size))
+    with threadpool_limits(limits=1):
+        for wavelength, weight in zip(camera.wavelength_nm, weights / weights.sum(), strict=True):
+            lambda_over_d = wavelength / diameter_nm * _NM_TO_ARCSEC * 1e9
+            psf += weight * _monochromatic(
+                amplitude, wavefront, wavelength, size, size * scale / lambda_over_d
+            )
+        if jitter:
+            psf = _jittered(psf, jitter / scale)
+    psf.setflags(write=False)
+    return psf
+
+
+def _monochromatic(
+    amplitude: FloatArray, wavefront: FloatArray, wavelength: float, size: int, extent: float
+) -> FloatArray:
+    """PSF at one wavelength; ``extent`` is the stamp's side in lambda / D, ``amplitude`` has unit power."""
+    # poppy takes seconds to import and brings matplotlib along: only who makes a PSF pays. Its plain numpy
+    # transform is used: the numexpr one starts threads of its own.
+    from poppy.matrixDFT import SYMMETRIC, matrix_dft  # noqa: PLC0415
+
+    field = amplitude.astype(np.complex128)
+    if np.any(wavefront):
+        field *= np.exp(2j * np.pi / wavelength * wavefront)
+    image = matrix_dft(field, extent, size, centering=SYMMETRIC)
+    return np.asarray(image.real**2 + image.imag**2, dtype=np.float64)
+
+
+def _jittered(psf: FloatArray, sigma: float) -> FloatArray:
+    """Convolve the stamp with a Gaussian of ``sigma`` sub-pixels; what leaves the stamp is lost."""
+    n = psf.shape[0]
+    padded = fft.next_fast_len(n + 2 * math.ceil(6 * sigma), real=True)
+    gaussian = np.exp(-2 * (np.pi * sigma * fft.fftfreq(padded)) ** 2)
+    spectrum = fft.rfft2(psf, (padded, padded)) * gaussian[:, None] * gaussian[None, : padded // 2 + 1]
+    return np.asarray(fft.irfft2(spectrum, (padded, padded))[:n, :n])
+
+
+def detector_kernel(camera: Camera) -> FloatArray:
+    """Return the camera's 3 x 3 kernel (capacitance or charge diffusion) on native pixels, of sum 1."""
+    kernel = np.asarray(camera.detector_kernel, dtype=np.float64)
+    return np.asarray(kernel / kernel.sum())
+
+
+def effective_psf(psf: FloatArray, oversampling: int, kernel: FloatArray) -> FloatArray:
+    """Find what a native pixel measures of a star, as a function of the star's offset from the pixel.
+
+    Parameters
+    ----------
+    psf
+        Optical PSF, odd square, ``oversampling`` sub-pixels to the native pixel.
+    kernel
+        3 x 3 detector kernel of sum 1.
+
+    Returns
+    -------
+    Array larger than ``psf`` by 2 native pixels on each side, in the same sub-pixels, centred likewise. Flux
+    per *sub-pixel* area, so that its sum is that of ``psf``; times oversampling^2 it is the flux in a native
+    pixel.
+    """
+    border = 2 * oversampling
+    n = psf.shape[0] + 2 * border
+    size = fft.next_fast_len(n + 2 * border, real=True)
+    fy, fx = fft.fftfreq(size)[:, None], fft.rfftfreq(size)[None, :]
+    # The box of a native pixel and the kernel's nine impulses are exact in Fourier space for a band-limited
+    # PSF.
+    response = np.sinc(fy * oversampling) * np.sinc(fx * oversampling)
+    spread = np.zeros((size, size // 2 + 1), dtype=np.complex128)
+    for j, i in np.ndindex(3, 3):
+        spread += kernel[j, i] * np.exp(-2j * np.pi * oversampling * (fy * (j - 1) + fx * (i - 1)))
+    padded = np.zeros((size, size))
+    padded[border : border + psf.shape[0], border : border + psf.shape[1]] = psf
+    return np.asarray(fft.irfft2(fft.rfft2(padded) * response * spread, (size, size))[:n, :n])
+
+
+def encircled_energy(psf: FloatArray, pixel_scale: float, radii: FloatArray) -> FloatArray:
+    """Flux of a PSF inside circles about its central pixel.
+
+    Parameters
+    ----------
+    psf
+        Odd square array of flux per pixel.
+    pixel_scale
+        Side of its pixels [arcsec].
+    radii
+        Radii [arcsec], any shape.
+
+    Returns
+    -------
+    Flux inside each radius, in the unit of ``psf`` (no normalisation). A pixel that a circle cuts counts by
+    the fraction of its area inside, found on 16 x 16 points.
+    """
+    if psf.ndim != 2 or psf.shape[0] != psf.shape[1] or psf.shape[0] % 2 == 0:
+        raise ObservationError(f"psf: got shape {psf.shape}, allowed is an odd square")
+    n, fine = psf.shape[0], 16
+    axis = (np.arange(n) - n // 2) * pixel_scale
+    r = np.hypot(axis[:, None], axis[None, :])
+    offsets = ((np.arange(fine) + 0.5) / fine - 0.5) * pixel_scale
+    oy, ox = (grid.ravel() for grid in np.meshgrid(offsets, offsets, indexing="ij"))
+    result = np.empty(np.shape(radii))
+    for index, radius in np.ndenumerate(radii):
+        half_diagonal = pixel_scale / math.sqrt(2)
+        rows, columns = np.nonzero(np.abs(r - radius) <= half_diagonal)
+        inside = np.hypot(axis[rows, None] + oy, axis[columns, None] + ox) <= radius
+        result[index] = psf[r < radius - half_diagonal].sum() + psf[rows, columns] @ inside.mean(axis=1)
+    return result
+
+
+def full_width_half_maximum(psf: FloatArray, pixel_scale: float) -> float:
+    """Full width at half maximum [arcsec]: 2 sqrt(A / pi) with A the area above half of the central value.
+
+    The half-maximum contour is found on a six times finer grid by Fourier interpolation of the core.
+    """
+    centre = psf.shape[0] // 2
+    half = min(centre, 32)
+    core = psf[centre - half : centre + half + 1, centre - half : centre + half + 1]
+    n, zoom = core.shape[0], 6
+    spectrum = np.zeros((n * zoom, n * zoom), dtype=np.complex128)
+    start = (n * zoom) // 2 - n // 2
+    spectrum[start : start + n, start : start + n] = fft.fftshift(fft.fft2(core))
+    fine = fft.ifft2(fft.ifftshift(spectrum)).real * zoom**2
+    area = np.count_nonzero(fine >= 0.5 * psf[centre, centre]) * (pixel_scale / zoom) ** 2
+    return 2.0 * math.sqrt(area / math.pi)
