@@ -77,15 +77,19 @@ def point_source_image(
     image = np.zeros(geometry.high_resolution_shape)
     if not len(positions):
         return image
-    size = fft.next_fast_len(psf.shape[0] + 2 * guard, real=True)
-    half = psf.shape[0] // 2 + guard
+    centre = (np.array(image.shape[::-1]) - 1) / 2
+    pixels = positions / geometry.subpixel_scale + centre
+    # What cannot reach the grid from any of the sources need not be moved there.
+    farthest = np.maximum(np.abs(pixels), np.abs(pixels - 2 * centre)).max()
+    spare = max(0, psf.shape[0] // 2 - guard - int(min(farthest + 1, psf.shape[0])))
+    stamp = psf[spare : psf.shape[0] - spare, spare : psf.shape[1] - spare]
+    size = fft.next_fast_len(stamp.shape[0] + 2 * guard, real=True)
+    half = stamp.shape[0] // 2 + guard
     padded = np.zeros((size, size))
-    padded[guard : guard + psf.shape[0], guard : guard + psf.shape[1]] = psf
+    padded[guard : guard + stamp.shape[0], guard : guard + stamp.shape[1]] = stamp
     fy, fx = fft.fftfreq(size), fft.rfftfreq(size)
     spectrum = fft.rfft2(padded) * np.sinc(fy)[:, None] * np.sinc(fx)[None, :]
-    centre = (np.array(image.shape[::-1]) - 1) / 2
-    for position, flux in zip(positions, fluxes, strict=True):
-        pixel = position / geometry.subpixel_scale + centre
+    for pixel, flux in zip(pixels, fluxes, strict=True):
         whole = np.rint(pixel).astype(int)
         dx, dy = pixel - whole
         phase = np.exp(-2j * np.pi * fy * dy)[:, None] * np.exp(-2j * np.pi * fx * dx)[None, :]

@@ -34,7 +34,8 @@ class DrizzledPsf:
         Odd square, centred on its middle pixel, flux per drizzled pixel; its sum is the fraction of a star's
         flux inside the stamp.
     phase_error
-        Standard deviation over the phases, same shape and unit.
+        Standard deviation over the phases, same shape and unit: what a star differs by from the PSF moved to
+        it by a Fourier shift. Drizzled pixels that undersample the star (ACS, scale ratio 1) are most of it.
     oversampled
         The same on a grid ``oversampling`` times finer, side 2 radius oversampling + 1, interlaced from the
         phases: the flux that a drizzled pixel has at that offset from a star, over oversampling^2, so that
@@ -75,22 +76,22 @@ def drizzled_psf(
     reach = (phases - 1) * (_WHOLE_STEP + 1)
     border = radius + _GUARD + (reach + 1) // 2 + 1
     wide = resized(geometry, (2 * border + 1, 2 * border + 1))
-    stars = [(_WHOLE_STEP * i - reach // 2, i / phases) for i in range(phases)]
+    middle = np.array(wide.drizzled_shape) // 2
+    origin = (np.array(wide.drizzled_shape) - 1) / 2
+    stars = [(_WHOLE_STEP * i - reach // 2, i) for i in range(phases)]
     moved, oversampled = [], np.zeros((2 * radius * phases + 1,) * 2)
-    for i_y, (whole_y, phase_y) in enumerate(stars):
-        for i_x, (whole_x, phase_x) in enumerate(stars):
-            offset = np.array([[whole_x + phase_x, whole_y + phase_y]]) * wide.drizzled_scale
-            star = point_source_image(offset, np.ones(1), psf, wide)
+    for whole_y, i_y in stars:
+        for whole_x, i_x in stars:
+            row, column = middle[0] + whole_y, middle[1] + whole_x
+            pixel = np.array([[column + i_x / phases - origin[1], row + i_y / phases - origin[0]]])
+            star = point_source_image(pixel * wide.drizzled_scale, np.ones(1), psf, wide)
             image = drizzle(expose(star, wide, detector_kernel), wide)
-            stamp = _cut(image, border + whole_y, border + whole_x, radius + _GUARD)
-            inner = stamp[_GUARD : -_GUARD or None, _GUARD : -_GUARD or None]
-            # Pixel k of the cut lies (k - radius) - phase from the star: in fine pixels (k - radius) phases -
-            # i.
-            first_y, first_x = (1 if i_y else 0), (1 if i_x else 0)
-            oversampled[first_y * phases - i_y :: phases, first_x * phases - i_x :: phases] = inner[
-                first_y:, first_x:
-            ]
-            moved.append(_shifted(stamp, -phase_x, -phase_y)[_GUARD:-_GUARD, _GUARD:-_GUARD])
+            stamp = _cut(image, row, column, radius + _GUARD)
+            # Pixel k of the inner part lies (k - radius) - i / phases pixels from the star.
+            first_y, first_x = int(i_y > 0), int(i_x > 0)
+            fine = oversampled[first_y * phases - i_y :: phases, first_x * phases - i_x :: phases]
+            fine[...] = stamp[_GUARD:-_GUARD, _GUARD:-_GUARD][first_y:, first_x:]
+            moved.append(_shifted(stamp, -i_x / phases, -i_y / phases)[_GUARD:-_GUARD, _GUARD:-_GUARD])
     cube = np.array(moved)
     return DrizzledPsf(cube.mean(axis=0), cube.std(axis=0), oversampled / phases**2, phases)
 

@@ -175,9 +175,21 @@ def exposure_geometry(
 
 
 def resized(geometry: Geometry, drizzled_shape: tuple[int, int]) -> Geometry:
-    """Keep the sampling for a drizzled image of another shape."""
-    native = _native_shape(drizzled_shape, geometry.drizzle_ratio, geometry.shifts, geometry.subpixels)
-    return replace(geometry, drizzled_shape=drizzled_shape, native_shape=native)
+    """Keep the sampling for a drizzled image of at least another shape.
+
+    The shape is rounded up to the parity of the geometry's own, and so is the native shape: only then do
+    native and drizzled pixels lie with respect to each other, and to the origin, as they did.
+    """
+    ny, nx = (n + (n - old) % 2 for n, old in zip(drizzled_shape, geometry.drizzled_shape, strict=True))
+    native_y, native_x = (
+        n + (n - old) % 2
+        for n, old in zip(
+            _native_shape((ny, nx), geometry.drizzle_ratio, geometry.shifts, geometry.subpixels),
+            geometry.native_shape,
+            strict=True,
+        )
+    )
+    return replace(geometry, drizzled_shape=(ny, nx), native_shape=(native_y, native_x))
 
 
 def _native_shape(

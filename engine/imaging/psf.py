@@ -1,11 +1,12 @@
 """The point-spread function: polychromatic diffraction through the pupil, and the detector on top of it.
 
 Two arrays are told apart. The *optical* PSF is point-sampled: the irradiance at the centre of each sub-pixel
-times the sub-pixel's area. It is band-limited and sampled above its Nyquist rate, so convolving it with an
-image that is already integrated over the sub-pixels gives the blurred image integrated over the sub-pixels,
-exactly; a point source is integrated over the sub-pixels where it is placed
-(:func:`engine.imaging.blurring.point_source_image`). The *effective* PSF is what a native pixel measures: the
-optical one integrated over the pixel and spread by the detector kernel, sampled at the sub-pixels.
+times the sub-pixel's area. It is band-limited and sampled above its Nyquist rate. Convolving it with an image
+that is already integrated over the sub-pixels gives the blurred image integrated over the sub-pixels, without
+another box blur, as long as the image is smooth on the scale of a sub-pixel. A point source is not; it is
+integrated over the sub-pixels where it is placed (:func:`engine.imaging.blurring.point_source_image`). The
+*effective* PSF is what a native pixel measures: the optical one integrated over the pixel and spread by the
+detector kernel, sampled at the sub-pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ PUPIL_PIXELS = 512
 _NM_TO_ARCSEC = 1e-9 * math.degrees(1.0) * 3600.0
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=8)
 def telescope_psf(
     camera: Camera,
     *,
