@@ -71,8 +71,12 @@ class AgnImage:
 
 @dataclass(frozen=True, config=_STRICT)
 class ExposurePlan:
-    """What is taken at each dither position: ``n_long`` exposures of ``long_s`` and one of ``short_s`` seconds."""
+    """What is taken at each dither position: ``n_long`` exposures of ``long_s`` and one of ``short_s`` seconds.
 
+    ``field_pixels`` is the side of the drizzled image.
+    """
+
+    field_pixels: Annotated[int, Field(ge=16, le=1000)]
     dither: Identifier
     long_s: Annotated[float, Field(gt=0.0, le=1e5)]
     n_long: Annotated[int, Field(ge=1, le=100)]

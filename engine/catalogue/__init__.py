@@ -64,7 +64,7 @@ def load_system(name: str) -> LensSystem:
     document = {
         "name": name,
         "camera": facts["camera"],
-        "exposures": _pick(facts["exposures"], "dither", "long_s", "n_long", "short_s"),
+        "exposures": _pick(facts["exposures"], "field_pixels", "dither", "long_s", "n_long", "short_s"),
         "agn": [{"name": label, **image} for label, image in facts["agn"]["images"].items()],
         "deflector": _pick(facts["deflector"], *light),
         "host_q": facts["host_shape"]["q"],

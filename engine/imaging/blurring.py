@@ -97,6 +97,25 @@ def point_source_image(
     return image
 
 
+def place_stamp(
+    psf: FloatArray, shape: tuple[int, int], column: float, row: float, *, guard: int = 8
+) -> FloatArray:
+    """Image (ny, nx) of a point source of unit flux at pixel (column, row): the stamp moved there band-limited.
+
+    For images whose exposures are not known; parts of the stamp that leave the image are lost.
+    """
+    whole_row, whole_column = int(np.rint(row)), int(np.rint(column))
+    ny, nx = (fft.next_fast_len(n + 2 * guard, real=True) for n in psf.shape)
+    padded = np.zeros((ny, nx))
+    padded[guard : guard + psf.shape[0], guard : guard + psf.shape[1]] = psf
+    phase = np.exp(-2j * np.pi * fft.fftfreq(ny) * (row - whole_row))[:, None]
+    phase = phase * np.exp(-2j * np.pi * fft.rfftfreq(nx) * (column - whole_column))[None, :]
+    moved = fft.irfft2(fft.rfft2(padded) * phase, (ny, nx))
+    image = np.zeros(shape)
+    _add_stamp(image, moved, whole_row - psf.shape[0] // 2 - guard, whole_column - psf.shape[1] // 2 - guard)
+    return image
+
+
 def _add_stamp(image: FloatArray, stamp: FloatArray, row: int, column: int) -> None:
     """Add ``stamp`` to ``image`` in place with its first pixel at (row, column), which may lie outside."""
     ny, nx = image.shape

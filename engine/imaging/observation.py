@@ -12,6 +12,8 @@ from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
+from engine.imaging.blurring import place_stamp
+from engine.imaging.response import PointResponse
 
 Provenance = Mapping[str, str | float | int]
 
@@ -40,6 +42,8 @@ class Observation:
         Pixels that may be used, same shape as the image; all where None is given.
     provenance
         Where it comes from: names to text or numbers.
+    response
+        The exposures behind the image, where they are known: point sources are then exact, not shifted stamps.
     """
 
     image: FloatArray
@@ -50,6 +54,7 @@ class Observation:
     covariance: sparse.csr_matrix | None = None
     valid: NDArray[np.bool_] | None = None
     provenance: Provenance = field(default_factory=dict)
+    response: PointResponse | None = None
 
     def __post_init__(self) -> None:
         """Copy, freeze and check; an ObservationError names what is wrong."""
@@ -109,6 +114,14 @@ class Observation:
         """(ny, nx) of the image."""
         ny, nx = self.image.shape
         return ny, nx
+
+    def point_source(self, x: float, y: float) -> FloatArray:
+        """Image (ny, nx) of a point source of unit flux at (x, y) [arcsec, image frame]."""
+        if self.response is not None:
+            return self.response.image(x, y)
+        ny, nx = self.shape
+        column, row = x / self.pixel_scale + (nx - 1) / 2.0, y / self.pixel_scale + (ny - 1) / 2.0
+        return place_stamp(self.psf, self.shape, column, row)
 
 
 def _frozen(name: str, values: ArrayLike) -> FloatArray:

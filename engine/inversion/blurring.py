@@ -62,29 +62,3 @@ def blurring_matrix(
     out = np.zeros(dy.shape)
     out[seen] = kernel[dy[seen], dx[seen]]
     return out
-
-
-def blur(image: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Convolution of an image with an odd kernel, same shape, no light wrapping round."""
-    shape = tuple(fft.next_fast_len(n + k, real=True) for n, k in zip(image.shape, kernel.shape, strict=True))
-    product = fft.irfft2(fft.rfft2(image, s=shape) * fft.rfft2(kernel, s=shape), s=shape)
-    cy, cx = kernel.shape[0] // 2, kernel.shape[1] // 2
-    return np.asarray(product[cy : cy + image.shape[0], cx : cx + image.shape[1]])
-
-
-def point_source_column(psf: FloatArray, shape: tuple[int, int], column: float, row: float) -> FloatArray:
-    """Image of shape (ny, nx) of a point source of unit flux at pixel (column, row), moved there band-limited."""
-    ny, nx = shape
-    ky, kx = psf.shape
-    py, px = fft.next_fast_len(ny + 2 * ky, real=True), fft.next_fast_len(nx + 2 * kx, real=True)
-    base_row, base_column = int(np.rint(row)), int(np.rint(column))
-    if not (-ky < base_row < ny + ky and -kx < base_column < nx + kx):
-        raise ObservationError(f"point source at pixel ({column}, {row}): outside the image of shape {shape}")
-    phase = np.exp(-2j * np.pi * (row - base_row) * fft.fftfreq(py))[:, None]
-    phase = phase * np.exp(-2j * np.pi * (column - base_column) * fft.rfftfreq(px))[None, :]
-    canvas = np.zeros((py, px))
-    canvas[:ky, :kx] = psf
-    # Put the stamp's centre on the nearest pixel; the padding of one stamp on each side takes what falls outside.
-    canvas = np.roll(canvas, (base_row - ky // 2 + ky, base_column - kx // 2 + kx), axis=(0, 1))
-    moved = fft.irfft2(fft.rfft2(canvas) * phase, s=(py, px))
-    return np.asarray(moved[ky : ky + ny, kx : kx + nx])

@@ -10,8 +10,9 @@ from scipy.ndimage import distance_transform_edt
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
+from engine.imaging.blurring import convolve
 from engine.imaging.observation import Observation
-from engine.inversion.blurring import blur, central_stamp, pixel_kernel, point_source_column
+from engine.inversion.blurring import central_stamp, pixel_kernel
 from engine.inversion.mapping import cast_rays
 from engine.inversion.operator import LinearData, Operator, build_operator
 from engine.light.rendering import render_sersic
@@ -55,15 +56,11 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
     names, images = [], []
     for k, agn in enumerate(fit.agn):
         names.append(f"agn{k + 1}")
-        images.append(
-            point_source_column(
-                observation.psf, (ny, nx), agn.x / scale + (nx - 1) / 2.0, agn.y / scale + (ny - 1) / 2.0
-            )
-        )
+        images.append(observation.point_source(agn.x, agn.y))
     if fit.deflector is not None:
         light = render_sersic(fit.deflector, pixel_centres(nx, scale), pixel_centres(ny, scale), scale)
         names.append("deflector")
-        images.append(blur(light, pixel_kernel(observation.psf, None)) / fit.deflector.flux)
+        images.append(convolve(light, pixel_kernel(observation.psf, None)) / fit.deflector.flux)
     names.append("background")
     images.append(np.ones((ny, nx)))
     return tuple(names), np.stack(images)

@@ -16,8 +16,9 @@ from scipy.optimize import least_squares
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import PosteriorError
+from engine.imaging.blurring import convolve
 from engine.imaging.observation import Observation
-from engine.inversion.blurring import blur, central_stamp, pixel_kernel, point_source_column
+from engine.inversion.blurring import central_stamp, pixel_kernel
 from engine.lensing.power_law import PowerLawLens, source_position
 from engine.light.rendering import render_sersic, sample_lensed_sersic
 from engine.light.sersic import SersicProfile
@@ -26,8 +27,10 @@ from engine.modelling.point_sources import Detection, find_point_sources
 
 _HOST_SUBRAYS = 3
 _KERNEL_RADIUS = 20
-_PSF_ERROR = 0.03
-"""Standard deviation of the PSF model as a fraction of the AGN's light: keeps its cores from driving the fit."""
+_STAMP_ERROR = 0.03
+"""Error of a shifted PSF stamp as a fraction of the AGN's light: keeps the cores from driving the fit."""
+_RESPONSE_ERROR = 0.002
+"""The same where the exposures are known: what errors of position leave."""
 _POSITION_ERROR = 0.01
 """Image-plane accuracy [arcsec] asked of the AGN images as images of one source."""
 _MAX_ELLIPTICITY = 0.6
@@ -85,10 +88,11 @@ class _ImageModel:
         stamp = central_stamp(observation.psf, _KERNEL_RADIUS)
         self.sampled_kernel = pixel_kernel(stamp, _HOST_SUBRAYS)
         self.integrated_kernel = pixel_kernel(stamp, None)
+        psf_error = _STAMP_ERROR if observation.response is None else _RESPONSE_ERROR
         agn_light = np.zeros((ny, nx))
         for found in detections:
-            agn_light += found.flux * self.point_source(found.x, found.y)
-        sigma = np.where(observation.valid, np.hypot(observation.noise, _PSF_ERROR * agn_light), 1.0)
+            agn_light += found.flux * observation.point_source(found.x, found.y)
+        sigma = np.where(observation.valid, np.hypot(observation.noise, psf_error * agn_light), 1.0)
         self.weight = np.where(observation.valid, 1.0 / sigma, 0.0).ravel()
         self.data = np.where(observation.valid, observation.image, 0.0).ravel() * self.weight
         self.n_agn = len(detections)
@@ -99,25 +103,17 @@ class _ImageModel:
         self._deflector_column = lru_cache(maxsize=4)(self._render_deflector)
         self._host_column = lru_cache(maxsize=4)(self._render_host)
 
-    def point_source(self, x: float, y: float) -> FloatArray:
-        """Image of a point source of unit flux at (x, y) [arcsec]."""
-        ny, nx = self.observation.image.shape
-        scale = self.observation.pixel_scale
-        return point_source_column(
-            self.observation.psf, (ny, nx), x / scale + (nx - 1) / 2.0, y / scale + (ny - 1) / 2.0
-        )
-
     def _render_agn(self, x: float, y: float) -> FloatArray:
-        return self.point_source(x, y).ravel() * self.weight
+        return self.observation.point_source(x, y).ravel() * self.weight
 
     def _render_deflector(self, *values: float) -> FloatArray:
         image = render_sersic(self.deflector_of(values), self.x, self.y, self.observation.pixel_scale, tolerance=1e-3)
-        return blur(image, self.integrated_kernel).ravel() * self.weight
+        return convolve(image, self.integrated_kernel).ravel() * self.weight
 
     def _render_host(self, *values: float) -> FloatArray:
         lens, host = self.lens_of(values[: self.lens_size]), self.host_of(values[self.lens_size :])
         image = sample_lensed_sersic(host, lens, self.x, self.y, self.observation.pixel_scale, _HOST_SUBRAYS)
-        return blur(image, self.sampled_kernel).ravel() * self.weight
+        return convolve(image, self.sampled_kernel).ravel() * self.weight
 
     def deflector_of(self, values: Sequence[float], flux: float = 1.0) -> SersicProfile:
         """The deflector's profile of its parameters ln r_eff, n, e1, e2, x, y."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter
+from scipy import ndimage
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
-from engine.inversion.blurring import blur, central_stamp, point_source_column
+from engine.imaging.blurring import convolve, place_stamp
+from engine.inversion.blurring import central_stamp
 
 _FILTER_RADIUS = 3
 _CENTRE_RADIUS = 0.25
@@ -29,11 +30,9 @@ class Detection:
 def remove_deflector(image: FloatArray, pixel_scale: float) -> FloatArray:
     """The image less the median over circles round its centre: point sources and arcs stay, the deflector goes."""
     y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
-    ring = np.rint(np.hypot(x, y) / pixel_scale).astype(int)
-    order = np.argsort(ring, axis=None)
-    edges = np.searchsorted(ring.ravel()[order], np.arange(ring.max() + 2))
-    medians = [np.median(image.ravel()[order[a:b]]) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    return np.asarray(image - np.array(medians)[ring])
+    _, ring = np.unique(np.rint(np.hypot(x, y) / pixel_scale), return_inverse=True)
+    medians = ndimage.median(image, labels=ring, index=np.arange(ring.max() + 1))
+    return np.asarray(image - np.asarray(medians)[ring])
 
 
 def _subpixel_peak(values: FloatArray, row: int, column: int) -> tuple[float, float]:
@@ -83,14 +82,14 @@ def find_point_sources(
     level = float(np.median(noise)) * float(np.sqrt((template**2).sum()))
     found: list[Detection] = []
     for _ in range(number):
-        filtered = blur(rest, template)
-        peaks = allowed & (filtered == maximum_filter(filtered, size=3)) & (filtered > 5.0 * level)
+        filtered = convolve(rest, template)
+        peaks = allowed & (filtered == ndimage.maximum_filter(filtered, size=3)) & (filtered > 5.0 * level)
         if not peaks.any():
             raise ObservationError(f"agn: found {len(found)} point sources of {number}, at five sigma or more")
         row, column = np.unravel_index(int(np.argmax(np.where(peaks, filtered, -np.inf))), image.shape)
         peak_row, peak_column = _subpixel_peak(filtered, int(row), int(column))
         flux = float(filtered[row, column]) / energy
-        rest = rest - flux * point_source_column(psf, image.shape, peak_column, peak_row)
+        rest = rest - flux * place_stamp(psf, image.shape, peak_column, peak_row)
         allowed &= np.hypot(x - x[row, column], y - y[row, column]) > 2.0 * pixel_scale
         found.append(
             Detection(

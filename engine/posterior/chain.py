@@ -88,7 +88,7 @@ def _start(target: Target, proposal: _IndependenceProposal, walkers: int, random
 
 def autocorrelation_time(samples: FloatArray) -> float:
     """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters)."""
-    times = emcee.autocorr.integrated_time(samples, quiet=True, has_walkers=True)
+    times = emcee.autocorr.integrated_time(samples, tol=0, has_walkers=True)
     return float(np.max(times)) if np.all(np.isfinite(times)) else math.inf
 
 

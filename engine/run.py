@@ -1,0 +1,309 @@
+"""One run: realization in, result out. Each step is a function of its own module; this one only joins them.
+
+    Realization -> Scene -> Observation -> parametric start -> posterior -> source draws -> refits -> RunResult
+
+From the observation on nothing sees the truth; it comes back at the very end, for the biases.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from engine.conventions import FloatArray, rate_to_magnitude
+from engine.digest import engine_digest, engine_versions
+from engine.imaging.observation import Observation
+from engine.inversion.evidence import Inversion
+from engine.inversion.problem import Problem, prepare_problem
+from engine.lensing.power_law import PowerLawLens
+from engine.light.sersic import SersicProfile, mean_surface_brightness
+from engine.modelling.parametric import fit_parametric
+from engine.posterior.chain import Chain, run_chain
+from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
+from engine.posterior.target import Target, flat_prior
+from engine.refit import SourceDraw, fit_draws, profile_on_grid, summarise
+from engine.result import (
+    Estimate,
+    EstimatorName,
+    IndexPrior,
+    LensParameter,
+    Products,
+    Quantity,
+    RunResult,
+    StageTime,
+)
+from engine.scene import build_scene
+from engine.simulation import simulate
+from engine.spec import Analysis, Realization
+
+Progress = Callable[[str, float], None]
+STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
+_TYPICAL_LN_LAMBDA = -15.0
+"""Middle of the interval that is searched for ln lambda, 40 wide: lambda has units, but no scene strays that far."""
+
+
+@dataclass
+class _Stopwatch:
+    """Wall and CPU time of each stage, told to ``progress`` as they begin."""
+
+    progress: Progress | None
+    stages: list[StageTime] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        if self.progress is not None:
+            self.progress(name, 0.0)
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.stages.append(StageTime(name, time.perf_counter() - wall, time.process_time() - cpu))
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a simulation knows and an observation does not."""
+
+    lens: PowerLawLens
+    host: SersicProfile
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the analysis of an observation finds."""
+
+    estimates: tuple[Estimate, ...]
+    lens: tuple[LensParameter, ...]
+    chain: Chain
+    best: Inversion
+    ln_evidence: float
+    chi2: float
+    degrees_of_freedom: int
+    products: Products
+    warnings: tuple[str, ...]
+
+
+def generator(realization: Realization, purpose: int) -> np.random.Generator:
+    """The random generator of a realization for one purpose: equal specs give equal streams."""
+    key = int(realization.digest[:16], 16)
+    return np.random.default_rng(np.random.SeedSequence([realization.seed, key, purpose]))
+
+
+def _lens_parameters(target: Target, chain: Chain, truth: Truth | None) -> tuple[LensParameter, ...]:
+    flat = chain.flat()
+    out = []
+    for k, name in enumerate(target.prior.names):
+        mean, sd = float(flat[:, k].mean()), float(flat[:, k].std(ddof=1))
+        true: float | None = None
+        if truth is not None and name != "ln_lambda":
+            true = float(getattr(truth.lens, name))
+            if name == "phi":
+                true = mean + math.remainder(true - mean, math.pi)
+        out.append(LensParameter(name, Quantity(mean, sd, true)))
+    return tuple(out)
+
+
+def _products(
+    observation: Observation, problem: Problem, best: Inversion, target: Target, chain: Chain, truth: Truth | None
+) -> tuple[Products, float]:
+    """Maps for figures and files at the best state of the chain, and its chi^2."""
+    operator, mask = problem.operator, problem.mask
+    arc = operator.blurring @ best.mapping.apply(best.source.ravel())
+    amplitudes = operator.fit_amplitudes(arc)
+    arc_image = np.zeros(observation.shape)
+    arc_image[mask] = arc
+    model = arc_image + np.tensordot(amplitudes, problem.amplitude_images, axes=1)
+    residual = np.zeros(observation.shape)
+    fitted = mask & ~problem.core
+    residual[fitted] = ((observation.image - model) / observation.noise)[fitted]
+    shape = best.grid.shape
+    products = Products(
+        image=observation.image,
+        noise=observation.noise,
+        model=model,
+        arc_model=arc_image,
+        residual=residual,
+        mask=mask,
+        pixel_scale=observation.pixel_scale,
+        source=best.source,
+        source_sd=np.sqrt(best.source_variance()),
+        source_truth=None if truth is None else profile_on_grid(truth.host, best.grid).reshape(shape),
+        source_extent=best.grid.extent,
+        chain=chain.flat(),
+        parameter_names=target.prior.names,
+    )
+    return products, operator.chi2(arc, amplitudes)
+
+
+def _refit(
+    draws: list[SourceDraw],
+    zero_point: float,
+    truth: Truth | None,
+    fixed_index: float | None,
+    rng: np.random.Generator,
+) -> tuple[Estimate, ...]:
+    names: tuple[EstimatorName, ...] = ("paper", "projected")
+    priors: list[tuple[IndexPrior, float | None]] = [("free", None)]
+    if fixed_index is not None:
+        priors.append(("fixed", fixed_index))
+    out = []
+    for name in names:
+        for prior, index in priors:
+            fits, failed = fit_draws(draws, name, index, rng)
+            out.append(summarise(fits, failed, name, prior, zero_point, truth.host if truth else None))
+    return tuple(out)
+
+
+def measure(
+    observation: Observation,
+    analysis: Analysis,
+    rng: np.random.Generator,
+    *,
+    agn_images: int,
+    deflector: bool = True,
+    shear: bool = False,
+    fixed_index: float | None = None,
+    truth: Truth | None = None,
+    watch: _Stopwatch | None = None,
+) -> Measurement:
+    """Analyse an observation; ``truth`` is used for nothing but the biases.
+
+    Parameters
+    ----------
+    observation : Observation
+    analysis : Analysis
+        Source grid, regularisation, noise treatment, mask, chain.
+    rng : Generator
+        For the chain and the draws.
+    agn_images : int
+        How many AGN images the observer sees.
+    deflector, shear : bool
+        Whether the deflector shines, whether the lens model has external shear.
+    fixed_index : float, optional
+        The n at which the fixed-n estimates hold it; without it there are none.
+
+    Raises
+    ------
+    ObservationError, PosteriorError, InversionError
+        The observation cannot be analysed; the message says what stands in the way.
+    """
+    watch = watch or _Stopwatch(None)
+    with watch.stage("parametric"):
+        fit = fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
+    with watch.stage("prepare"):
+        problem = prepare_problem(observation, fit, analysis)
+    with watch.stage("optimum"):
+        prior = flat_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear)
+        target = Target(problem.operator, prior, analysis.source_pixels, analysis.regularisation)
+        start = target.vector(fit.lens, optimal_strength(target, fit.lens))
+        laplace = find_optimum(target, start, start_covariance(fit.lens_covariance))
+    with watch.stage("chain"):
+        report = watch.progress
+        chain = run_chain(
+            target,
+            laplace,
+            walkers=analysis.walkers,
+            max_steps=analysis.max_steps,
+            rng=rng,
+            progress=None if report is None else lambda done: report("chain", done),
+        )
+    with watch.stage("draws"):
+        draws = []
+        for state in chain.thinned(analysis.draws, rng):
+            inversion = target.invert(state)
+            draws.append(SourceDraw(inversion, inversion.draw_source(rng)))
+        flat_ln = chain.ln_posterior.ravel()
+        best = target.invert(chain.flat()[int(np.argmax(flat_ln))])
+        products, chi2 = _products(observation, problem, best, target, chain, truth)
+    with watch.stage("refit"):
+        estimates = _refit(draws, observation.zero_point, truth, fixed_index, rng)
+    warnings = []
+    if chain.summary.status != "converged":
+        warnings.append(
+            f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
+            "autocorrelation times, 50 are asked for"
+        )
+    if target.refused:
+        warnings.append(f"evidence: {target.refused} of {target.evaluations} inversions were refused")
+    fitted = int((problem.mask & ~problem.core).sum())
+    return Measurement(
+        estimates=estimates,
+        lens=_lens_parameters(target, chain, truth),
+        chain=chain,
+        best=best,
+        ln_evidence=best.ln_evidence,
+        chi2=chi2,
+        degrees_of_freedom=fitted - problem.operator.amplitudes,
+        products=products,
+        warnings=tuple(warnings),
+    )
+
+
+def run(realization: Realization, progress: Progress | None = None) -> RunResult:
+    """Simulate and analyse one realization.
+
+    Parameters
+    ----------
+    realization : Realization
+    progress : callable, optional
+        Called as ``progress(stage, fraction)`` with a stage of :data:`STAGES` and the part of it that is done.
+
+    Raises
+    ------
+    SpecError
+        The realization asks for something that is not there.
+    EngineError
+        The run has no trustworthy result; the message says why.
+    """
+    watch = _Stopwatch(progress)
+    # One thread: a worker is given one core, and sums in a fixed order give the same bits everywhere.
+    with threadpool_limits(1):
+        with watch.stage("simulate"):
+            scene = build_scene(realization)
+            simulation = simulate(scene, realization.noise_level, generator(realization, 0))
+        found = measure(
+            simulation.observation,
+            realization.analysis,
+            generator(realization, 1),
+            agn_images=len(scene.agn),
+            deflector=scene.deflector is not None,
+            shear=scene.lens.gamma1 != 0.0 or scene.lens.gamma2 != 0.0,
+            fixed_index=scene.host.n,
+            truth=Truth(scene.lens, scene.host),
+            watch=watch,
+        )
+    zero_point = scene.camera.zero_point
+    agn_flux = sum(source.flux for source in scene.agn)
+    noise = simulation.exposures.noise
+    warnings = found.warnings
+    if noise.level != noise.requested:
+        warnings = (*warnings, f"noise: camera has no level {noise.requested!r}, {noise.level!r} was used")
+    return RunResult(
+        realization_digest=realization.digest,
+        engine_digest=engine_digest(),
+        versions=engine_versions(),
+        seed=realization.seed,
+        noise_level=noise.level,
+        noise_treatment=realization.analysis.noise_treatment,
+        estimates=found.estimates,
+        lens=found.lens,
+        chain=found.chain.summary,
+        ln_evidence=found.ln_evidence,
+        chi2=found.chi2,
+        degrees_of_freedom=found.degrees_of_freedom,
+        condition_number=found.best.condition_number,
+        arc_magnitude=simulation.arc_magnitude,
+        agn_contrast=(
+            rate_to_magnitude(agn_flux, zero_point) - simulation.arc_magnitude if agn_flux > 0 else None
+        ),
+        surface_brightness=mean_surface_brightness(
+            rate_to_magnitude(scene.host.flux, zero_point), scene.host.r_eff
+        ),
+        stages=tuple(watch.stages),
+        warnings=warnings,
+        products=found.products,
+    )
