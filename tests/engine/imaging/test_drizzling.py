@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from engine.errors import ObservationError
-from engine.imaging.blurring import point_source_image
+from engine.imaging.blurring import convolve, point_source_image
 from engine.imaging.drizzled_psf import drizzled_psf
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance, drizzled_variance
 from engine.imaging.exposures import expose
@@ -34,6 +34,17 @@ def test_flux_is_conserved_over_the_field(setup):
     period = 32  # whole beats of drizzled and native pixels in each of the cameras
     inner = gain[8 : 8 + period, 8 : 8 + period]
     assert inner.mean() == pytest.approx(1, abs=1e-4)
+
+
+def test_flux_of_a_lensed_quasar_is_conserved(setup):
+    # An Einstein ring with the four AGN images on it; asked for is 1e-3 in all.
+    geometry, radius = setup.geometry, 0.2 * min(setup.geometry.drizzled_shape) *
+    setup.geometry.drizzled_scale x, y = geometry.high_resolution_axes() ring = np.exp(-((np.hypot(x, y[:,
+    None]) - radius) ** 2) / (2 * 0.08**2)) angles = np.array([0.4, 1.9, 3.3, 5.1]) agn = radius *
+    np.stack([np.cos(angles), np.sin(angles)], axis=-1) light = convolve(ring / ring.sum(), setup.psf) light
+    += point_source_image(agn, [0.9, 0.7, 0.8, 0.5], setup.psf, geometry) image = drizzle(expose(light,
+    geometry, setup.kernel), geometry) assert image.sum() == pytest.approx((1 + 2.9) * setup.psf.sum(),
+    rel=1e-3)
 
 
 def test_star_flux_is_conserved_as_well_as_the_weights_are_even(setup, request):
