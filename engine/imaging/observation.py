@@ -52,7 +52,7 @@ class Observation:
     pixel_scale: float
     zero_point: float
     covariance: sparse.csr_matrix | None = None
-    valid: NDArray[np.bool_] | None = None
+    valid: NDArray[np.bool_] = None  # type: ignore[assignment]  # never None after __post_init__
     provenance: Provenance = field(default_factory=dict)
     response: PointResponse | None = None
 
@@ -106,7 +106,9 @@ class Observation:
             raise ObservationError("covariance: not symmetric")
         if not (covariance.diagonal()[valid.ravel()] > 0).all():
             raise ObservationError("covariance: a valid pixel has no positive variance")
-        covariance.sum_duplicates()
+        covariance.sum_duplicates()  # sorts as well
+        for part in (covariance.data, covariance.indices, covariance.indptr):
+            part.setflags(write=False)
         object.__setattr__(self, "covariance", covariance)
 
     @property

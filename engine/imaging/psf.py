@@ -24,10 +24,8 @@ from engine.imaging.pupil import pupil_transmission, pupil_wavefront
 from engine.spec import Camera
 
 PUPIL_PIXELS = 512
-_NM_TO_ARCSEC = 1e-9 * math.degrees(1.0) * 3600.0
 
 
-@lru_cache(maxsize=8)
 def telescope_psf(
     camera: Camera,
     *,
@@ -70,12 +68,30 @@ def telescope_psf(
     factor = camera.oversampling if oversampling is None else oversampling
     scale = camera.pixel_scale / factor
     size = 2 * round((field_of_view / scale - 1) / 2) + 1
-    diameter_nm = camera.pupil.primary_diameter_m * 1e9
-    nyquist = min(camera.wavelength_nm) / diameter_nm * _NM_TO_ARCSEC * 1e9 / 2
+    nyquist = min(camera.wavelength_nm) * _nm_to_lambda_over_d(camera) / 2
     if scale > nyquist or size < 3:
-        raise SpecError(
-            "oversampling", factor, f"sub-pixels below {nyquist:.4f} arcsec and a stamp of at least 3"
-        )
+        allowed = f"sub-pixels below {nyquist:.4f} arcsec and a stamp of at least 3"
+        raise SpecError("oversampling", factor, allowed)
+    # The cache sees the arguments made definite, so that a default and the same value given are one entry.
+    return _telescope_psf(
+        camera,
+        scale=scale,
+        size=size,
+        defocus_nm=float(defocus_nm),
+        jitter=float(jitter),
+        pupil_pixels=pupil_pixels,
+    )
+
+
+def _nm_to_lambda_over_d(camera: Camera) -> float:
+    """Lambda / D [arcsec] of a wavelength of 1 nm."""
+    return math.degrees(1e-9 / camera.pupil.primary_diameter_m) * 3600.0
+
+
+@lru_cache(maxsize=8)
+def _telescope_psf(
+    camera: Camera, *, scale: float, size: int, defocus_nm: float, jitter: float, pupil_pixels: int
+) -> FloatArray:
     amplitude = pupil_transmission(camera.pupil, pupil_pixels)
     wavefront = pupil_wavefront(camera.pupil, pupil_pixels, defocus_nm=defocus_nm)
     # The open area, not the sum of squares, is the power: a pupil pixel that is half open lets half the light
@@ -83,14 +99,13 @@ def telescope_psf(
     amplitude /= math.sqrt(np.sum(amplitude))
     weights = np.asarray(camera.throughput) * np.gradient(np.asarray(camera.wavelength_nm))
     psf = np.zeros((size, size))
+    # One thread: more of them may add up in another order, and the same run must give the same bits anywhere.
     with threadpool_limits(limits=1):
         for wavelength, weight in zip(camera.wavelength_nm, weights / weights.sum(), strict=True):
-            lambda_over_d = wavelength / diameter_nm * _NM_TO_ARCSEC * 1e9
-            psf += weight * _monochromatic(
-                amplitude, wavefront, wavelength, size, size * scale / lambda_over_d
-            )
-        if jitter:
-            psf = _jittered(psf, jitter / scale)
+            extent = size * scale / (wavelength * _nm_to_lambda_over_d(camera))
+            psf += weight * _monochromatic(amplitude, wavefront, wavelength, size, extent)
+    if jitter:
+        psf = _jittered(psf, jitter / scale)
     psf.setflags(write=False)
     return psf
 

@@ -32,7 +32,8 @@ FWHM = {"WFC3-IR_F160W": 0.010, "WFC3-UVIS_F814W": 0.003, "ACS-WFC_F814W": 0.013
 
 def effective(camera_name):
     camera = load_camera(camera_name)
-    psf = telescope_psf(camera)
+    # 5 arcsec hold all radii of the tables that are compared; a larger stamp has the same values there.
+    psf = telescope_psf(camera, field_of_view=5.0)
     return effective_psf(
         psf, camera.oversampling, detector_kernel(camera)
     ), camera.pixel_scale / camera.oversampling
@@ -147,6 +148,12 @@ def test_undersampled_psf_is_refused():
 def test_detector_kernel_keeps_the_light():
     for camera_name in FWHM:
         assert detector_kernel(load_camera(camera_name)).sum() == pytest.approx(1, abs=1e-15)
+
+
+def test_psf_is_kept_in_memory():
+    camera = load_camera("WFC3-IR_F160W")
+    args = {"field_of_view": 4.0, "pupil_pixels": 256}
+    assert telescope_psf(camera, **args) is telescope_psf(camera, **args, oversampling=4)
 
 
 def test_importing_the_module_does_not_import_poppy():
