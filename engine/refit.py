@@ -16,10 +16,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy import linalg, optimize
 from scipy.linalg import lapack
 
+from engine.compiled import kernel
 from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.errors import InversionError
 from engine.inversion.evidence import Inversion
@@ -51,30 +51,35 @@ class SersicFit:
     at_bound: bool
 
 
-@njit(nogil=True, cache=True)
-def _mean_profile(x: FloatArray, y: FloatArray, dx: float, dy: float, light: FloatArray) -> FloatArray:
-    """Mean surface brightness over the cells round the nodes: many points near the centre, few elsewhere."""
-    out = np.empty(x.size * y.size)
-    for j in range(y.size):
-        for i in range(x.size):
-            distance = max(abs(x[i] - light[7]) / dx, abs(y[j] - light[8]) / dy)
+@kernel
+def _mean_profile(xe: FloatArray, ye: FloatArray, light: FloatArray) -> FloatArray:
+    """Mean surface brightness over cells between edges: many points near the centre, few elsewhere."""
+    nx, ny = xe.size - 1, ye.size - 1
+    out = np.empty(nx * ny)
+    for j in range(ny):
+        dy = ye[j + 1] - ye[j]
+        for i in range(nx):
+            dx = xe[i + 1] - xe[i]
+            away_x = abs(xe[i] + 0.5 * dx - light[7]) / dx
+            away_y = abs(ye[j] + 0.5 * dy - light[8]) / dy
+            distance = max(away_x, away_y)
             points = 9 if distance < 1.5 else (5 if distance < 4.0 else 2)
             total = 0.0
             for b in range(points):
-                v0 = y[j] + ((b + 0.5) / points - 0.5) * dy - light[8]
+                v0 = ye[j] + (b + 0.5) / points * dy - light[8]
                 for a in range(points):
-                    u0 = x[i] + ((a + 0.5) / points - 0.5) * dx - light[7]
+                    u0 = xe[i] + (a + 0.5) / points * dx - light[7]
                     u = light[5] * u0 + light[6] * v0
                     v = light[5] * v0 - light[6] * u0
                     z = (light[4] * u * u + v * v / light[4]) * light[3]
                     total += math.exp(-light[1] * z ** light[2])
-            out[j * x.size + i] = light[0] * total / (points * points)
+            out[j * nx + i] = light[0] * total / (points * points)
     return out
 
 
 def profile_on_grid(profile: SersicProfile, grid: SourceGrid) -> FloatArray:
     """Mean surface brightness [e-/s arcsec^-2] of a profile over the cell round each node, (ny nx,)."""
-    return np.asarray(_mean_profile(grid.x, grid.y, grid.dx, grid.dy, kernel_arguments(profile)))
+    return np.asarray(_mean_profile(grid.x_edges, grid.y_edges, kernel_arguments(profile)))
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,9 @@ class _LeastSquares:
 
 
 def _paper_metric(draw: SourceDraw) -> _LeastSquares:
-    return _LeastSquares(lambda source: source, draw.source.ravel())
+    """Every part of the source plane counts alike: weights are the square roots of the cells' areas."""
+    root = np.sqrt(draw.inversion.grid.cell_areas / draw.inversion.grid.cell_areas.mean()).ravel()
+    return _LeastSquares(lambda source: root * source, root * draw.source.ravel())
 
 
 def _projected_metric(draw: SourceDraw) -> _LeastSquares:
@@ -101,7 +108,7 @@ def _projected_metric(draw: SourceDraw) -> _LeastSquares:
     return _LeastSquares(lambda source: upper @ source[order], target)
 
 
-def _profile(values: Sequence[float], fixed_index: float | None) -> SersicProfile:
+def _profile(values: Sequence[float] | FloatArray, fixed_index: float | None) -> SersicProfile:
     ln_r, e1, e2, x, y, *rest = (float(value) for value in values)
     e = min(math.hypot(e1, e2), 0.9)
     n = rest[0] if fixed_index is None else fixed_index
@@ -112,15 +119,13 @@ def _moments(draw: SourceDraw) -> FloatArray:
     """Start values ln r, e1, e2, x, y, n from the brightest part of the mean source of the draw's inversion."""
     grid, source = draw.inversion.grid, draw.inversion.source
     y, x = np.meshgrid(grid.y, grid.x, indexing="ij")
-    weight = np.clip(source - 0.1 * source.max(), 0.0, None)
+    weight = np.clip(source - 0.1 * source.max(), 0.0, None) * grid.cell_areas
     if not weight.sum() > 0:
         raise InversionError("source of the draw: nowhere positive, no profile can be fitted")
     weight = weight / weight.sum()
     cx, cy = float((weight * x).sum()), float((weight * y).sum())
-    xx, yy, xy = (
-        float((weight * u).sum()) for u in ((x - cx) ** 2, (y - cy) ** 2, (x - cx) * (y - cy))
-    )
-    size = max(xx + yy, grid.dx**2)
+    xx, yy, xy = (float((weight * u).sum()) for u in ((x - cx) ** 2, (y - cy) ** 2, (x - cx) * (y - cy)))
+    size = max(xx + yy, float(grid.cell_areas.min()))
     e = 0.5 * np.array([(xx - yy) / size, 2 * xy / size])
     return np.array([0.5 * math.log(size), *np.clip(e, -0.5, 0.5), cx, cy, 2.0])
 
@@ -131,7 +136,8 @@ def _fit(
     grid = draw.inversion.grid
     left, right, bottom, top = grid.extent
     e = _MAX_ELLIPTICITY
-    low = [math.log(0.1 * min(grid.dx, grid.dy)), -e, -e, left, bottom, INDEX_RANGE[0]]
+    pitch = math.sqrt(float(grid.cell_areas.min()))
+    low = [math.log(0.1 * pitch), -e, -e, left, bottom, INDEX_RANGE[0]]
     high = [math.log(5.0 * max(right - left, top - bottom)), e, e, right, top, INDEX_RANGE[1]]
     size = 6 if fixed_index is None else 5
 
@@ -148,7 +154,7 @@ def _fit(
         lambda values: flux_and_residual(values)[1] / unit,
         np.clip(start[:size], lower + 1e-6, upper - 1e-6),
         bounds=(lower, upper),
-        x_scale=np.array([0.3, 0.2, 0.2, grid.dx, grid.dy, 0.5])[:size],
+        x_scale=np.array([0.3, 0.2, 0.2, pitch, pitch, 0.5])[:size],
         ftol=1e-9,
         xtol=1e-7,
         max_nfev=200,

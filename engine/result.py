@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from engine.conventions import FloatArray
 
 EstimatorName = Literal["paper", "projected"]
@@ -86,8 +89,8 @@ class Products:
     """Arrays of a run: image-plane maps on the drizzled grid, source-plane maps on the source grid.
 
     ``image``, ``model``, ``residual`` (normalised) are (ny, nx) in e-/s and sigma; ``mask`` is True where fitted;
-    ``source``, ``source_truth`` and ``source_sd`` are (ny, nx) in e-/s per arcsec^2 over ``source_extent``
-    (left, right, bottom, top) [arcsec]; ``draws`` is (draws, ny, nx); ``chain`` is (samples, parameters) in the
+    ``source``, ``source_truth`` and ``source_sd`` are (ny, nx) in e-/s per arcsec^2 on cells with edges
+    ``source_x_edges`` (nx + 1,) and ``source_y_edges`` (ny + 1,) [arcsec]; ``chain`` is (samples, parameters) in the
     order of ``parameter_names``.
     """
 
@@ -96,12 +99,13 @@ class Products:
     model: FloatArray
     arc_model: FloatArray
     residual: FloatArray
-    mask: FloatArray
+    mask: NDArray[np.bool_]
     pixel_scale: float
     source: FloatArray
     source_sd: FloatArray
     source_truth: FloatArray | None
-    source_extent: tuple[float, float, float, float]
+    source_x_edges: FloatArray
+    source_y_edges: FloatArray
     chain: FloatArray
     parameter_names: tuple[str, ...]
 

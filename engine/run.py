@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from engine.conventions import FloatArray, rate_to_magnitude
+from engine.conventions import rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.imaging.observation import Observation
-from engine.inversion.evidence import Inversion
+from engine.inversion.evidence import Inversion, SourceModel
 from engine.inversion.problem import Problem, prepare_problem
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, mean_surface_brightness
@@ -44,7 +44,7 @@ from engine.spec import Analysis, Realization
 
 Progress = Callable[[str, float], None]
 STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
-_TYPICAL_LN_LAMBDA = -15.0
+_TYPICAL_LN_LAMBDA = -10.0
 """Middle of the interval that is searched for ln lambda, 40 wide: lambda has units, but no scene strays that far."""
 
 
@@ -132,7 +132,8 @@ def _products(
         source=best.source,
         source_sd=np.sqrt(best.source_variance()),
         source_truth=None if truth is None else profile_on_grid(truth.host, best.grid).reshape(shape),
-        source_extent=best.grid.extent,
+        source_x_edges=best.grid.x_edges,
+        source_y_edges=best.grid.y_edges,
         chain=chain.flat(),
         parameter_names=target.prior.names,
     )
@@ -198,7 +199,8 @@ def measure(
         problem = prepare_problem(observation, fit, analysis)
     with watch.stage("optimum"):
         prior = flat_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear)
-        target = Target(problem.operator, prior, analysis.source_pixels, analysis.regularisation)
+        source = SourceModel(analysis.source_pixels, analysis.regularisation, analysis.source_softening)
+        target = Target(problem.operator, prior, source)
         start = target.vector(fit.lens, optimal_strength(target, fit.lens))
         laplace = find_optimum(target, start, start_covariance(fit.lens_covariance))
     with watch.stage("chain"):
@@ -297,12 +299,8 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
         degrees_of_freedom=found.degrees_of_freedom,
         condition_number=found.best.condition_number,
         arc_magnitude=simulation.arc_magnitude,
-        agn_contrast=(
-            rate_to_magnitude(agn_flux, zero_point) - simulation.arc_magnitude if agn_flux > 0 else None
-        ),
-        surface_brightness=mean_surface_brightness(
-            rate_to_magnitude(scene.host.flux, zero_point), scene.host.r_eff
-        ),
+        agn_contrast=(rate_to_magnitude(agn_flux, zero_point) - simulation.arc_magnitude if agn_flux > 0 else None),
+        surface_brightness=mean_surface_brightness(rate_to_magnitude(scene.host.flux, zero_point), scene.host.r_eff),
         stages=tuple(watch.stages),
         warnings=warnings,
         products=found.products,

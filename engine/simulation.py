@@ -1,6 +1,6 @@
 """The forward simulation: from a scene to a drizzled observation, each step a function of its own.
 
-    Scene -> noiseless high-resolution image -> dithered noisy exposures -> drizzled Observation
+Scene -> noiseless high-resolution image -> dithered noisy exposures -> drizzled Observation
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_variance
 from engine.imaging.observation import Observation
-from engine.imaging.response import PointResponse
 from engine.imaging.psf import detector_kernel, telescope_psf
+from engine.imaging.response import PointResponse
 from engine.light.rendering import render_sersic
 from engine.scene import Scene
 from engine.spec import Camera, NoiseLevel

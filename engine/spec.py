@@ -193,10 +193,12 @@ class Analysis:
     ``mask_inner`` and ``mask_outer`` bound the ring of fitted pixels in units of the measured Einstein radius;
     ``core_radius`` [arcsec] is the region round each AGN image whose noise is boosted to be effectively infinite;
     ``subrays`` rays are traced along each side of an image pixel; ``ray_margin`` [pixels] is how far outside the
-    mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid.
+    mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid,
+    evenly spaced where ``source_softening`` is None, else crowded round the AGN within that fraction of its half-width.
     """
 
     source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (30, 30)
+    source_softening: Annotated[float, Field(gt=0.01, le=10.0)] | None = None
     regularisation: RegularisationName = "curvature"
     noise_treatment: NoiseTreatment = "diagonal"
     mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
@@ -205,8 +207,8 @@ class Analysis:
     subrays: Annotated[int, Field(ge=1, le=8)] = 2
     ray_margin: Annotated[int, Field(ge=0, le=40)] = 4
     psf_radius: Annotated[int, Field(ge=1, le=80)] = 15
-    walkers: Annotated[int, Field(ge=16, le=1000)] = 24
-    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 400
+    walkers: Annotated[int, Field(ge=18, le=1000)] = 18
+    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 240
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
 
 

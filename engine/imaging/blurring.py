@@ -97,9 +97,7 @@ def point_source_image(
     return image
 
 
-def place_stamp(
-    psf: FloatArray, shape: tuple[int, int], column: float, row: float, *, guard: int = 8
-) -> FloatArray:
+def place_stamp(psf: FloatArray, shape: tuple[int, int], column: float, row: float, *, guard: int = 8) -> FloatArray:
     """Image (ny, nx) of a point source of unit flux at pixel (column, row): the stamp moved there band-limited.
 
     For images whose exposures are not known; parts of the stamp that leave the image are lost.

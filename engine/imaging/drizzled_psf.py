@@ -70,9 +70,7 @@ def drizzled_psf(
         Star positions along each axis, 1 / phases of a drizzled pixel apart (modulo whole pixels).
     """
     if radius < 1 or phases < 1:
-        raise ObservationError(
-            f"drizzled psf: got radius {radius} and {phases} phases, allowed are 1 and more"
-        )
+        raise ObservationError(f"drizzled psf: got radius {radius} and {phases} phases, allowed are 1 and more")
     reach = (phases - 1) * (_WHOLE_STEP + 1)
     border = radius + _GUARD + (reach + 1) // 2 + 1
     wide = resized(geometry, (2 * border + 1, 2 * border + 1))
@@ -103,7 +101,5 @@ def _cut(image: FloatArray, row: int, column: int, half: int) -> FloatArray:
 def _shifted(stamp: FloatArray, shift_x: float, shift_y: float) -> FloatArray:
     """Move the stamp by a sub-pixel shift, in Fourier space."""
     ny, nx = stamp.shape
-    phase = np.exp(-2j * np.pi * fft.fftfreq(ny) * shift_y)[:, None] * np.exp(
-        -2j * np.pi * fft.rfftfreq(nx) * shift_x
-    )
+    phase = np.exp(-2j * np.pi * fft.fftfreq(ny) * shift_y)[:, None] * np.exp(-2j * np.pi * fft.rfftfreq(nx) * shift_x)
     return np.asarray(fft.irfft2(fft.rfft2(stamp) * phase, (ny, nx)))

@@ -25,14 +25,10 @@ def pixel_map(geometry: Geometry, index: int) -> FloatArray:
     ny, nx = geometry.drizzled_shape
     columns = x / geometry.drizzled_scale + (nx - 1) / 2
     rows = y / geometry.drizzled_scale + (ny - 1) / 2
-    return np.stack(np.broadcast_arrays(columns[np.newaxis, :], rows[:, np.newaxis]), axis=-1).astype(
-        np.float64
-    )
+    return np.stack(np.broadcast_arrays(columns[np.newaxis, :], rows[:, np.newaxis]), axis=-1).astype(np.float64)
 
 
-def _add(
-    sum_: Drizzle, exposure: FloatArray, geometry: Geometry, index: int, weight: FloatArray | None
-) -> None:
+def _add(sum_: Drizzle, exposure: FloatArray, geometry: Geometry, index: int, weight: FloatArray | None) -> None:
     sum_.add_image(
         exposure,
         exptime=1.0,
@@ -94,9 +90,7 @@ def drizzle_weights(geometry: Geometry) -> sparse.csr_matrix:
         for j, i in np.ndindex(step, step):
             comb = np.zeros(geometry.native_shape)
             comb[j::step, i::step] = 1.0
-            one = Drizzle(
-                kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True, fillval=0.0
-            )
+            one = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True, fillval=0.0)
             _add(one, comb, geometry, index, None)
             weight = np.asarray(one.out_wht, dtype=np.float64)
             product = np.asarray(one.out_img, dtype=np.float64) * weight
@@ -126,9 +120,7 @@ def _comb_step(geometry: Geometry) -> int:
     return math.ceil(2.2 * geometry.pixfrac + geometry.drizzle_ratio) + 1
 
 
-def _nearest(
-    axis: int, geometry: Geometry, index: int, step: int
-) -> list[np.ndarray[tuple[int], np.dtype[np.intp]]]:
+def _nearest(axis: int, geometry: Geometry, index: int, step: int) -> list[np.ndarray[tuple[int], np.dtype[np.intp]]]:
     """Find, for each phase of the comb, the native index of the tooth nearest to every drizzled pixel.
 
     Axis 0 is x.

@@ -71,9 +71,7 @@ class Geometry:
                 "positive scales, pixfrac in (0, 1]",
             )
         if self.margin < self.oversampling:
-            raise SpecError(
-                "margin", self.margin, f"at least one native pixel, {self.oversampling} sub-pixels"
-            )
+            raise SpecError("margin", self.margin, f"at least one native pixel, {self.oversampling} sub-pixels")
 
     @property
     def subpixel_scale(self) -> float:

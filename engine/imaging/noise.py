@@ -75,9 +75,7 @@ def exposure_variance(
     short = (rate + background) * plan.long_s > camera.full_well_e
     # Counts of one exposure have variance (rate + sky + dark) t + read noise^2; the rate is their mean over
     # n, over t.
-    long_variance = ((rate + background) * plan.long_s + camera.read_noise_e**2) / (
-        plan.n_long * plan.long_s**2
-    )
+    long_variance = ((rate + background) * plan.long_s + camera.read_noise_e**2) / (plan.n_long * plan.long_s**2)
     short_variance = ((rate + background) * plan.short_s + camera.read_noise_short_e**2) / plan.short_s**2
     return ExposureNoise(np.where(short, short_variance, long_variance), level, "handbook", short, saturated)
 

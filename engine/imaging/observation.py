@@ -71,9 +71,7 @@ class Observation:
         for name in ("pixel_scale", "zero_point"):
             value = float(getattr(self, name))
             if not np.isfinite(value) or (name == "pixel_scale" and value <= 0):
-                raise ObservationError(
-                    f"{name}: got {value}, allowed is a finite number, positive for a scale"
-                )
+                raise ObservationError(f"{name}: got {value}, allowed is a finite number, positive for a scale")
             object.__setattr__(self, name, value)
         for key, entry in self.provenance.items():
             if not isinstance(entry, str | float | int) or isinstance(entry, bool):
@@ -84,9 +82,7 @@ class Observation:
     def _check_image(self, valid: NDArray[np.bool_]) -> None:
         for name, array in (("noise", self.noise), ("valid", valid)):
             if array.shape != self.image.shape:
-                raise ObservationError(
-                    f"{name}: got shape {array.shape}, allowed is the image's {self.image.shape}"
-                )
+                raise ObservationError(f"{name}: got shape {array.shape}, allowed is the image's {self.image.shape}")
         if not valid.any():
             raise ObservationError("valid: no pixel is left")
         if not np.isfinite(self.image[valid]).all():

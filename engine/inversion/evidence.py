@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.inversion.mapping import Mapping, SourceGrid, map_rays
@@ -20,6 +20,15 @@ from engine.spec import RegularisationName
 
 MAX_CONDITION = 1e14
 """Beyond this the solution has lost all but two digits."""
+
+
+@dataclass(frozen=True)
+class SourceModel:
+    """How the source is described: (ny, nx) nodes, the regularisation, and the crowding of the nodes (None: even)."""
+
+    shape: tuple[int, int] = (30, 30)
+    regularisation: RegularisationName = "curvature"
+    softening: float | None = None
 
 
 @dataclass(frozen=True)
@@ -50,7 +59,7 @@ class Inversion:
         return np.asarray(np.diag(inverse).reshape(self.grid.shape))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _curvature(
     half_w: FloatArray, columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], n: int
 ) -> FloatArray:
@@ -88,15 +97,14 @@ def _curvature(
 
 
 def _factorise(
-    operator: Operator, lens: PowerLawLens, ln_lambda: float, shape: tuple[int, int], regularisation: RegularisationName
+    operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel
 ) -> tuple[Mapping, FloatArray, FloatArray, FloatArray, FloatArray]:
-    mapping = map_rays(operator.rays, kernel_arguments(lens), shape)
-    n = shape[0] * shape[1]
+    mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening)
+    n = model.shape[0] * model.shape[1]
     f = _curvature(operator.half_w, mapping.columns, mapping.weights, mapping.entries, n)
     d = mapping.transpose(operator.wd)
-    grid = mapping.grid
     a = np.asfortranarray(f)
-    add_regularisation(a, regularisation, shape, grid.dx, grid.dy, math.exp(ln_lambda))
+    add_regularisation(a, model.regularisation, model.shape, math.exp(ln_lambda))
     factor, info = lapack.dpotrf(a, lower=1, clean=1, overwrite_a=1)
     if info != 0:
         raise InversionError(
@@ -108,49 +116,39 @@ def _factorise(
 
 
 def _ln_evidence(
-    operator: Operator,
-    regularisation: RegularisationName,
-    ln_lambda: float,
-    grid: SourceGrid,
-    factor: FloatArray,
-    quadratic: float,
+    operator: Operator, model: SourceModel, ln_lambda: float, factor: FloatArray, quadratic: float
 ) -> float:
-    n = grid.ny * grid.nx
+    n = model.shape[0] * model.shape[1]
     ln_a = 2.0 * float(np.log(np.diag(factor)).sum())
-    ln_h = ln_determinant(regularisation, grid.shape, grid.dx, grid.dy)
-    return (
-        -0.5 * (operator.dd - quadratic) - 0.5 * ln_a + 0.5 * ln_h + 0.5 * n * ln_lambda + operator.ln_constant
-    )
+    ln_h = ln_determinant(model.regularisation, model.shape)
+    return -0.5 * (operator.dd - quadratic) - 0.5 * ln_a + 0.5 * ln_h + 0.5 * n * ln_lambda + operator.ln_constant
 
 
 def ln_evidence(
     operator: Operator,
     lens: PowerLawLens,
     ln_lambda: float,
-    shape: tuple[int, int],
-    regularisation: RegularisationName = "curvature",
+    model: SourceModel,
 ) -> float:
-    """ln Z of the data given lens and ln lambda, for a source grid of ``shape`` (ny, nx).
+    """Ln Z of the data given lens and ln lambda.
 
     An InversionError says what to change where A is not positive definite.
     """
-    mapping, _, d, factor, solution = _factorise(operator, lens, ln_lambda, shape, regularisation)
-    return _ln_evidence(operator, regularisation, ln_lambda, mapping.grid, factor, float(d @ solution))
+    _, _, d, factor, solution = _factorise(operator, lens, ln_lambda, model)
+    return _ln_evidence(operator, model, ln_lambda, factor, float(d @ solution))
 
 
 def invert(
     operator: Operator,
     lens: PowerLawLens,
     ln_lambda: float,
-    shape: tuple[int, int],
-    regularisation: RegularisationName = "curvature",
+    model: SourceModel,
 ) -> Inversion:
     """Solve the inversion and keep all of it; an InversionError tells where it cannot be trusted."""
-    mapping, f, d, factor, solution = _factorise(operator, lens, ln_lambda, shape, regularisation)
-    grid = mapping.grid
+    mapping, f, d, factor, solution = _factorise(operator, lens, ln_lambda, model)
     f = np.tril(f) + np.tril(f, -1).T
     full = f.copy()
-    add_regularisation(full, regularisation, shape, grid.dx, grid.dy, math.exp(ln_lambda))
+    add_regularisation(full, model.regularisation, model.shape, math.exp(ln_lambda))
     norm = float(np.abs(np.tril(full) + np.tril(full, -1).T).sum(axis=0).max())
     reciprocal, _ = lapack.dpocon(factor, norm, uplo="L")
     condition = math.inf if reciprocal == 0.0 else 1.0 / float(reciprocal)
@@ -160,10 +158,10 @@ def invert(
             "a larger lambda, fewer source pixels or a wider mask are needed"
         )
     return Inversion(
-        ln_evidence=_ln_evidence(operator, regularisation, ln_lambda, grid, factor, float(d @ solution)),
-        grid=grid,
+        ln_evidence=_ln_evidence(operator, model, ln_lambda, factor, float(d @ solution)),
+        grid=mapping.grid,
         mapping=mapping,
-        source=solution.reshape(shape),
+        source=solution.reshape(model.shape),
         factor=factor,
         curvature=f,
         data_vector=d,

@@ -6,12 +6,13 @@ of the mask, with nodes on its edges. A ray outside the rectangle carries no lig
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.lensing.power_law import trace_rays
@@ -19,39 +20,40 @@ from engine.lensing.power_law import trace_rays
 
 @dataclass(frozen=True)
 class SourceGrid:
-    """Nodes of the source: (ny, nx) of them from (x0, y0) in steps of dx, dy [arcsec]."""
+    """Nodes of the source at the crossings of ``x`` (nx,) and ``y`` (ny,) [arcsec], both increasing."""
 
-    x0: float
-    y0: float
-    dx: float
-    dy: float
-    ny: int
-    nx: int
+    x: FloatArray
+    y: FloatArray
 
     @property
     def shape(self) -> tuple[int, int]:
         """(ny, nx)."""
-        return self.ny, self.nx
+        return self.y.size, self.x.size
 
     @property
-    def x(self) -> FloatArray:
-        """Node coordinates along x [arcsec]."""
-        return self.x0 + self.dx * np.arange(self.nx)
+    def x_edges(self) -> FloatArray:
+        """Edges (nx + 1,) of the cells round the nodes: half-way to the neighbours."""
+        return _edges(self.x)
 
     @property
-    def y(self) -> FloatArray:
-        """Node coordinates along y [arcsec]."""
-        return self.y0 + self.dy * np.arange(self.ny)
+    def y_edges(self) -> FloatArray:
+        """Edges (ny + 1,) of the cells round the nodes."""
+        return _edges(self.y)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Edges of the pixels centred on the nodes: left, right, bottom, top [arcsec]."""
-        return (
-            self.x0 - 0.5 * self.dx,
-            self.x0 + (self.nx - 0.5) * self.dx,
-            self.y0 - 0.5 * self.dy,
-            self.y0 + (self.ny - 0.5) * self.dy,
-        )
+        """Outer edges: left, right, bottom, top [arcsec]."""
+        return tuple(map(float, (*self.x_edges[[0, -1]], *self.y_edges[[0, -1]])))  # type: ignore[return-value]
+
+    @property
+    def cell_areas(self) -> FloatArray:
+        """Areas (ny, nx) of the cells [arcsec^2]."""
+        return np.outer(np.diff(self.y_edges), np.diff(self.x_edges))
+
+
+def _edges(nodes: FloatArray) -> FloatArray:
+    middle = 0.5 * (nodes[1:] + nodes[:-1])
+    return np.concatenate([[2 * nodes[0] - middle[0]], middle, [2 * nodes[-1] - middle[-1]]])
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ class RayBundle:
     """Rays of the image pixels that matter, ``subrays**2`` consecutive ones a pixel.
 
     ``x``, ``y`` are (pixels * subrays^2,) positions [arcsec]; ``in_mask`` (pixels,) is True for pixels of the mask,
-    False for the margin whose light the PSF carries in; ``pixel_area`` [arcsec^2].
+    False for the margin whose light the PSF carries in; ``pixel_area`` [arcsec^2]; ``anchors`` (k, 2) are image
+    positions that map to where a concentrated source grid is finest: the AGN images.
     """
 
     x: FloatArray
@@ -67,6 +70,7 @@ class RayBundle:
     subrays: int
     in_mask: NDArray[np.bool_]
     pixel_area: float
+    anchors: FloatArray
 
     @property
     def pixels(self) -> int:
@@ -89,22 +93,30 @@ class Mapping:
 
     def dense(self) -> FloatArray:
         """L as an array of shape (pixels, ny nx)."""
-        out = np.zeros((self.entries.size, self.grid.ny * self.grid.nx))
+        out = np.zeros((self.entries.size, self.grid.x.size * self.grid.y.size))
         for row, count in enumerate(self.entries):
             np.add.at(out[row], self.columns[row, :count], self.weights[row, :count])
         return out
 
     def apply(self, source: FloatArray) -> FloatArray:
         """Image-plane fluxes (pixels,) before the PSF, of a source (ny nx,)."""
-        return _apply(self.columns, self.weights, self.entries, source)
+        return np.asarray(_apply(self.columns, self.weights, self.entries, source))
 
     def transpose(self, image: FloatArray) -> FloatArray:
         """L^T times an image-plane vector (pixels,): shape (ny nx,)."""
-        return _transpose(self.columns, self.weights, self.entries, image, self.grid.ny * self.grid.nx)
+        return np.asarray(
+            _transpose(self.columns, self.weights, self.entries, image, self.grid.x.size * self.grid.y.size)
+        )
 
 
 def cast_rays(
-    mask: NDArray[np.bool_], margin: NDArray[np.bool_], x: FloatArray, y: FloatArray, scale: float, subrays: int
+    mask: NDArray[np.bool_],
+    margin: NDArray[np.bool_],
+    x: FloatArray,
+    y: FloatArray,
+    scale: float,
+    subrays: int,
+    anchors: FloatArray | None = None,
 ) -> RayBundle:
     """Rays of the pixels of ``mask`` or ``margin`` (ny, nx) with centres x (nx,), y (ny,) and side ``scale``."""
     rows, columns = np.nonzero(mask | margin)
@@ -116,10 +128,11 @@ def cast_rays(
         subrays=subrays,
         in_mask=mask[rows, columns],
         pixel_area=scale * scale,
+        anchors=np.empty((0, 2)) if anchors is None else np.asarray(anchors, dtype=np.float64).reshape(-1, 2),
     )
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _bounds(bx: FloatArray, by: FloatArray, in_mask: NDArray[np.bool_], per_pixel: int) -> tuple[float, ...]:
     left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
     for pixel in range(in_mask.size):
@@ -130,33 +143,44 @@ def _bounds(bx: FloatArray, by: FloatArray, in_mask: NDArray[np.bool_], per_pixe
     return left, right, bottom, top
 
 
-@njit(nogil=True, cache=True)
+@inlined_kernel
+def _cell_of(value: float, nodes: FloatArray, guess: int) -> int:
+    """Index of the cell between two nodes that holds a value known to lie within the grid."""
+    i = min(max(guess, 0), nodes.size - 2)
+    while i > 0 and value < nodes[i]:
+        i -= 1
+    while i < nodes.size - 2 and value >= nodes[i + 1]:
+        i += 1
+    return i
+
+
+@kernel
 def _fill(
     bx: FloatArray,
     by: FloatArray,
     per_pixel: int,
-    grid: tuple[float, float, float, float],
-    ny: int,
-    nx: int,
+    x: FloatArray,
+    y: FloatArray,
     ray_weight: float,
     columns: NDArray[np.int32],
     weights: FloatArray,
     entries: NDArray[np.int32],
 ) -> None:
-    x0, y0, dx, dy = grid
-    tiny = 1e-9
+    nx = x.size
+    # The ray that defines an edge lies on it up to rounding.
+    tiny_x, tiny_y = 1e-9 * (x[1] - x[0]), 1e-9 * (y[1] - y[0])
+    i, j = 0, 0
     for pixel in range(entries.size):
         used = 0
         for ray in range(pixel * per_pixel, (pixel + 1) * per_pixel):
-            u = (bx[ray] - x0) / dx
-            v = (by[ray] - y0) / dy
-            # The ray that defines an edge lies on it up to rounding.
-            if u < -tiny or v < -tiny or u > nx - 1 + tiny or v > ny - 1 + tiny:
+            u, v = bx[ray], by[ray]
+            if u < x[0] - tiny_x or v < y[0] - tiny_y or u > x[-1] + tiny_x or v > y[-1] + tiny_y:
                 continue
-            i = min(max(int(u), 0), nx - 2)
-            j = min(max(int(v), 0), ny - 2)
-            fx = u - i
-            fy = v - j
+            # Neighbouring rays fall into neighbouring cells: the last cell is a good guess.
+            i = _cell_of(u, x, i)
+            j = _cell_of(v, y, j)
+            fx = (u - x[i]) / (x[i + 1] - x[i])
+            fy = (v - y[j]) / (y[j + 1] - y[j])
             for k in range(4):
                 a, b = k % 2, k // 2
                 weight = ray_weight * (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
@@ -173,7 +197,18 @@ def _fill(
         entries[pixel] = used
 
 
-@njit(nogil=True, cache=True)
+def _nodes(low: float, high: float, n: int, centre: float, softening: float | None) -> FloatArray:
+    """N nodes from low to high: even, or with a spacing that widens away from ``centre`` as cosh (sinh nodes)."""
+    if softening is None:
+        return np.linspace(low, high, n)
+    s = softening * 0.5 * (high - low)
+    t = np.linspace(math.asinh((low - centre) / s), math.asinh((high - centre) / s), n)
+    nodes = centre + s * np.sinh(t)
+    nodes[0], nodes[-1] = low, high
+    return np.asarray(nodes)
+
+
+@kernel
 def _apply(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], source: FloatArray
 ) -> FloatArray:
@@ -184,7 +219,7 @@ def _apply(
     return out
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _transpose(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], image: FloatArray, n: int
 ) -> FloatArray:
@@ -195,11 +230,17 @@ def _transpose(
     return out
 
 
-def map_rays(rays: RayBundle, lens_arguments: tuple[FloatArray, FloatArray], shape: tuple[int, int]) -> Mapping:
+def map_rays(
+    rays: RayBundle,
+    lens_arguments: tuple[FloatArray, FloatArray],
+    shape: tuple[int, int],
+    softening: float | None = None,
+) -> Mapping:
     """Trace the rays through the lens and lay the source grid of ``shape`` (ny, nx) round those of the mask.
 
-    ``lens_arguments`` are those of :func:`engine.lensing.power_law.kernel_arguments`. An InversionError tells of a
-    mask without pixels or rays that all fall on one line of the source plane.
+    ``lens_arguments`` are those of :func:`engine.lensing.power_law.kernel_arguments`. With a ``softening`` the nodes
+    crowd round the mapped anchors: their spacing is even within that fraction of the half-width and widens beyond. An
+    InversionError tells of a mask without pixels or rays that all fall on one line of the source plane.
     """
     ny, nx = shape
     if not rays.in_mask.any():
@@ -212,10 +253,16 @@ def map_rays(rays: RayBundle, lens_arguments: tuple[FloatArray, FloatArray], sha
         raise InversionError(
             f"mask: its rays span {right - left} x {top - bottom} arcsec of the source plane, an area is needed"
         )
-    grid = SourceGrid(left, bottom, (right - left) / (nx - 1), (top - bottom) / (ny - 1), ny, nx)
+    centre_x, centre_y = 0.5 * (left + right), 0.5 * (bottom + top)
+    if softening is not None and rays.anchors.size:
+        ax, ay = np.empty(len(rays.anchors)), np.empty(len(rays.anchors))
+        trace_rays(
+            np.ascontiguousarray(rays.anchors[:, 0]), np.ascontiguousarray(rays.anchors[:, 1]), *lens_arguments, ax, ay
+        )
+        centre_x, centre_y = float(ax.mean()), float(ay.mean())
+    grid = SourceGrid(_nodes(left, right, nx, centre_x, softening), _nodes(bottom, top, ny, centre_y, softening))
     columns = np.empty((rays.pixels, 4 * per_pixel), dtype=np.int32)
     weights = np.empty((rays.pixels, 4 * per_pixel))
     entries = np.empty(rays.pixels, dtype=np.int32)
-    ray_weight = rays.pixel_area / per_pixel
-    _fill(bx, by, per_pixel, (left, bottom, grid.dx, grid.dy), ny, nx, ray_weight, columns, weights, entries)
+    _fill(bx, by, per_pixel, grid.x, grid.y, rays.pixel_area / per_pixel, columns, weights, entries)
     return Mapping(grid, columns, weights, entries)

@@ -50,6 +50,11 @@ def ring_mask(
     return np.asarray((radius >= inner) & (radius <= outer))
 
 
+def _pixels(chosen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    rows, columns = np.nonzero(chosen)
+    return rows, columns
+
+
 def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tuple[str, ...], FloatArray]:
     ny, nx = observation.image.shape
     scale = observation.pixel_scale
@@ -115,7 +120,13 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
     names, images = _amplitude_images(observation, fit)
     margin = distance_transform_edt(~mask) <= analysis.ray_margin
     rays = cast_rays(
-        mask, margin, pixel_centres(shape[1], scale), pixel_centres(shape[0], scale), scale, analysis.subrays
+        mask,
+        margin,
+        pixel_centres(shape[1], scale),
+        pixel_centres(shape[0], scale),
+        scale,
+        analysis.subrays,
+        np.array([(agn.x, agn.y) for agn in fit.agn]),
     )
     linear = LinearData(
         data=observation.image[mask],
@@ -123,5 +134,5 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
         columns=np.ascontiguousarray(images[:, mask].T),
     )
     kernel = pixel_kernel(central_stamp(observation.psf, analysis.psf_radius), analysis.subrays)
-    operator = build_operator(linear, kernel, rays, np.nonzero(mask), np.nonzero(mask | margin))
+    operator = build_operator(linear, kernel, rays, _pixels(mask), _pixels(mask | margin))
     return Problem(operator=operator, mask=mask, core=core, amplitude_names=names, amplitude_images=images)

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import LensEquationError
 from engine.lensing.power_law import (
@@ -38,14 +38,14 @@ class LensedImage:
     magnification: float
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _source_and_determinant(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float, float]:
     ax, ay = deflect_point(x, y, p, a)
     kappa, g1, g2 = jacobian_point(x, y, p, a)
     return x - ax, y - ay, (1.0 - kappa) ** 2 - g1 * g1 - g2 * g2
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _holds(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> bool:
     """Whether the triangle a, b, c holds the origin."""
     d1 = ax * by - ay * bx
@@ -54,7 +54,7 @@ def _holds(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> 
     return (d1 >= 0.0 and d2 >= 0.0 and d3 >= 0.0) or (d1 <= 0.0 and d2 <= 0.0 and d3 <= 0.0)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArray) -> tuple[float, float, bool]:
     """Damped Newton on the lens equation; whether it converged to rounding."""
     ax, ay = deflect_point(x, y, p, a)
@@ -86,10 +86,8 @@ def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArr
     return x, y, error < 1e-12
 
 
-@njit(nogil=True, cache=True)
-def _candidates(
-    sx: float, sy: float, half: float, p: FloatArray, a: FloatArray, found: FloatArray
-) -> int:
+@kernel
+def _candidates(sx: float, sy: float, half: float, p: FloatArray, a: FloatArray, found: FloatArray) -> int:
     """Centroids of the triangles that hold the source, written into ``found`` (n, 2); how many."""
     corners = np.empty((4, 3))
     stack = np.empty((4 * _DEPTH + 8, 3))
@@ -108,9 +106,7 @@ def _candidates(
                 side = side0 * 0.5**depth
                 low, high = np.inf, -np.inf
                 for k in range(4):
-                    bx, by, determinant = _source_and_determinant(
-                        x0 + (k % 2) * side, y0 + (k // 2) * side, p, a
-                    )
+                    bx, by, determinant = _source_and_determinant(x0 + (k % 2) * side, y0 + (k // 2) * side, p, a)
                     corners[k, 0], corners[k, 1], corners[k, 2] = bx - sx, by - sy, determinant
                     low, high = min(low, determinant), max(high, determinant)
                 spread = high - low

@@ -17,8 +17,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
+from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import SpecError
 
@@ -99,7 +99,7 @@ def kernel_arguments(lens: PowerLawLens) -> tuple[FloatArray, FloatArray]:
     return packed, series_coefficients(lens.q, t)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined_kernel
 def deflect_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float]:
     """Deflection (alpha_x, alpha_y) [arcsec] at one point; ``p`` and ``a`` from :func:`kernel_arguments`.
 
@@ -128,10 +128,8 @@ def deflect_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[flo
     return c * ar - s * ai + shear_x, s * ar + c * ai + shear_y
 
 
-@njit(nogil=True, cache=True)
-def trace_rays(
-    x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray
-) -> None:
+@kernel
+def trace_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray) -> None:
     """Source positions of image positions, written into ``bx`` and ``by`` (all one-dimensional, same length).
 
     Works in blocks whose loops over points are innermost, so that the compiler can vectorise the series.
@@ -182,7 +180,7 @@ def trace_rays(
             by[start + i] = yi - (s * ar + c * ai + p[8] * xi - p[7] * yi)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined_kernel
 def jacobian_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float, float]:
     """Convergence and shear (kappa, g1, g2) at one point, which must not be the centre of the lens.
 
@@ -204,7 +202,7 @@ def jacobian_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[fl
     return kappa, (re * dx - im * dy) / r2 + p[7], (re * dy + im * dx) / r2 + p[8]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _convergence_and_shear(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, out: FloatArray) -> None:
     for i in range(x.size):
         out[0, i], out[1, i], out[2, i] = jacobian_point(x[i], y[i], p, a)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.lensing.power_law import PowerLawLens, deflect_point
 from engine.lensing.power_law import kernel_arguments as lens_arguments
@@ -21,6 +21,9 @@ from engine.light.sersic import kernel_arguments as sersic_arguments
 MAX_DEPTH = 9
 """Halvings of a pixel's side at most: 1/512 of a pixel resolves the cusp of n = 4 at r_eff of a pixel."""
 
+CUSP_DEPTH = 5
+"""Halvings down to which a cell that may hold the cusp is split whatever the rules say."""
+
 DEFAULT_TOLERANCE = 1e-4
 """Estimated error of a pixel as a fraction of the brightest pixel at which it is no longer refined."""
 
@@ -28,7 +31,7 @@ _G2 = 0.5 / math.sqrt(3.0)
 _G3 = 0.5 * math.sqrt(0.6)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@inlined_kernel
 def _brightness(
     x: float, y: float, light: FloatArray, lensed: bool, p: FloatArray, a: FloatArray
 ) -> tuple[float, float]:
@@ -44,7 +47,7 @@ def _brightness(
     return light[0] * math.exp(-light[1] * z ** light[2]), dx * dx + dy * dy
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _cell(
     x: float, y: float, h: float, light: FloatArray, lensed: bool, p: FloatArray, a: FloatArray
 ) -> tuple[float, float, float]:
@@ -66,8 +69,14 @@ def _cell(
     return three * h * h, abs(three - two) * h * h, nearest
 
 
-@njit(nogil=True, cache=True)
-def _integrate_pixel(
+@inlined_kernel
+def _is_rough(flux: float, difference: float, nearest: float, side: float, tolerance: float, depth: float) -> bool:
+    """Whether a cell must be split: the rules disagree, or it may hold the cusp, which hides from both."""
+    return difference > tolerance or (nearest < side * side and flux > tolerance and depth < CUSP_DEPTH)
+
+
+@kernel
+def _refine_pixel(
     x: float,
     y: float,
     h: float,
@@ -78,19 +87,20 @@ def _integrate_pixel(
     a: FloatArray,
     stack: FloatArray,
 ) -> float:
-    """Flux of one pixel; ``stack`` is scratch of shape (4 * MAX_DEPTH + 4, 3): x, y, depth."""
+    """Flux of one pixel by adaptive splitting; ``stack`` is scratch of shape (4 MAX_DEPTH + 4, 3): x, y, depth."""
     total = 0.0
     stack[0, 0], stack[0, 1], stack[0, 2] = x, y, 0.0
     top = 1
     while top > 0:
         top -= 1
         cx, cy, depth = stack[top, 0], stack[top, 1], stack[top, 2]
-        side = h * 0.5**depth
+        shrink = 0.5**depth
+        side = h * shrink
         flux, difference, nearest = _cell(cx, cy, side, light, lensed, p, a)
-        # A cell that may hold the cusp hides it from both rules: it is split until it is small. The largest
-        # stretch from source to cell is below one for images and the demagnified centre alike.
-        cusp = nearest < side * side and flux > tolerance
-        if depth < MAX_DEPTH and (difference > tolerance or (cusp and depth < 5)):
+        # Cells along a line through the cusp or an arc: their errors add up, so each may have its share only.
+        if depth == 0.0 or (
+            depth < MAX_DEPTH and _is_rough(flux, difference, nearest, side, tolerance * shrink, depth)
+        ):
             quarter = 0.25 * side
             for i in range(2):
                 for j in range(2):
@@ -103,22 +113,35 @@ def _integrate_pixel(
     return total
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _render(
-    xs: FloatArray, ys: FloatArray, h: float, relative: float, light: FloatArray, lensed: bool, p: FloatArray, a: FloatArray
+    xs: FloatArray,
+    ys: FloatArray,
+    h: float,
+    relative: float,
+    light: FloatArray,
+    lensed: bool,
+    p: FloatArray,
+    a: FloatArray,
 ) -> FloatArray:
     out = np.empty((ys.size, xs.size))
-    peak = 0.0
+    difference = np.empty((ys.size, xs.size))
+    nearest = np.empty((ys.size, xs.size))
+    stack = np.empty((4 * MAX_DEPTH + 4, 3))
+    top_i, top_j = 0, 0
     for j in range(ys.size):
         for i in range(xs.size):
-            value, _ = _brightness(xs[i], ys[j], light, lensed, p, a)
-            out[j, i] = value * h * h
-            peak = max(peak, out[j, i])
-    stack = np.empty((4 * MAX_DEPTH + 4, 3))
+            out[j, i], difference[j, i], nearest[j, i] = _cell(xs[i], ys[j], h, light, lensed, p, a)
+            if out[j, i] > out[top_j, top_i]:
+                top_i, top_j = i, j
+    # A point of the rule that meets the cusp makes its pixel too bright by far: measure the peak properly.
+    peak = out[top_j, top_i]
+    peak = min(peak, _refine_pixel(xs[top_i], ys[top_j], h, relative * peak, light, lensed, p, a, stack))
     tolerance = relative * peak
     for j in range(ys.size):
         for i in range(xs.size):
-            out[j, i] = _integrate_pixel(xs[i], ys[j], h, tolerance, light, lensed, p, a, stack)
+            if _is_rough(out[j, i], difference[j, i], nearest[j, i], h, tolerance, 0.0):
+                out[j, i] = _refine_pixel(xs[i], ys[j], h, tolerance, light, lensed, p, a, stack)
     return out
 
 
@@ -157,7 +180,7 @@ def render_sersic(
     return np.asarray(_render(x, y, pixel_scale, tolerance, light, lens is not None, p, a))
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sample(
     xs: FloatArray, ys: FloatArray, h: float, subrays: int, light: FloatArray, p: FloatArray, a: FloatArray
 ) -> FloatArray:

@@ -16,7 +16,9 @@ _AXIS_RATIO_PRIOR = (0.8, 0.15)
 _START_ANGLES = 6
 
 
-def lens_from_positions(positions: Sequence[tuple[float, float]], slope: float = 2.0) -> tuple[PowerLawLens, FloatArray]:
+def lens_from_positions(
+    positions: Sequence[tuple[float, float]], slope: float = 2.0
+) -> tuple[PowerLawLens, FloatArray]:
     """An elliptical power law of fixed slope at the origin that brings the images together in the source plane.
 
     The misfit is the scatter of the mapped images, weighted by the square root of their magnification so that it

@@ -124,7 +124,7 @@ class _ImageModel:
         """The host's profile of its parameters ln r_eff, n, e1, e2, x, y."""
         return self.deflector_of(values, flux)
 
-    def lens_of(self, values: Sequence[float]) -> PowerLawLens:
+    def lens_of(self, values: Sequence[float] | FloatArray) -> PowerLawLens:
         """The lens of its parameters theta_E, e1, e2, slope, x, y (and gamma1, gamma2)."""
         theta_E, e1, e2, slope, x, y, *shear = map(float, values)
         q, phi = _ellipse(e1, e2)
@@ -182,9 +182,7 @@ def _start_vector(
 def _bounds(model: _ImageModel, start: FloatArray, theta_E: float) -> tuple[FloatArray, FloatArray]:
     scale = model.observation.pixel_scale
     e = _MAX_ELLIPTICITY
-    half = []
-    for value in start[: model.agn_size]:
-        half.append((value - 1.5 * scale, value + 1.5 * scale))
+    half = [(value - 1.5 * scale, value + 1.5 * scale) for value in start[: model.agn_size].tolist()]
     if model.has_deflector:
         half += [(math.log(0.03), math.log(20.0)), (0.5, 9.0), (-e, e), (-e, e), (-0.3, 0.3), (-0.3, 0.3)]
     half += [(0.5 * theta_E, 1.6 * theta_E), (-e, e), (-e, e), (1.3, 2.7), (-0.3, 0.3), (-0.3, 0.3)]
@@ -254,9 +252,7 @@ def fit_parametric(
     return ParametricFit(
         lens=model.lens_of(lens_values.tolist()),
         host=model.host_of(host_values.tolist(), host_flux),
-        deflector=(
-            model.deflector_of(deflector_values.tolist(), float(amplitudes[agn_images])) if deflector else None
-        ),
+        deflector=(model.deflector_of(deflector_values.tolist(), float(amplitudes[agn_images])) if deflector else None),
         agn=tuple(
             Detection(float(x), float(y), float(flux), found.significance)
             for (x, y), flux, found in zip(agn, amplitudes[:agn_images], detections, strict=True)

@@ -1,1 +1,1 @@
-"""The posterior of lens and regularisation: target (:mod:`.target`), optimum (:mod:`.optimum`), chain (:mod:`.chain`)."""
+"""The posterior of lens and regularisation: :mod:`.target`, its :mod:`.optimum`, and the :mod:`.chain`."""

@@ -23,8 +23,8 @@ from engine.result import ChainStatus, ChainSummary
 
 _FREEDOM = 5.0
 _INDEPENDENCE_SHARE = 0.7
-_BURN_IN = 12
-_CHUNK = 10
+_BURN_IN_ROUNDS, _BURN_IN_STEPS = 2, 15
+_CHUNK = 15
 AUTOCORRELATION_TIMES = 50.0
 """A chain shorter than this many autocorrelation times is not called converged (emcee's own rule)."""
 
@@ -88,6 +88,9 @@ def _start(target: Target, proposal: _IndependenceProposal, walkers: int, random
 
 def autocorrelation_time(samples: FloatArray) -> float:
     """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters)."""
+    if np.any(np.ptp(samples, axis=0) == 0.0):
+        # A walker that has not moved yet has no autocorrelation to measure.
+        return math.inf
     times = emcee.autocorr.integrated_time(samples, tol=0, has_walkers=True)
     return float(np.max(times)) if np.all(np.isfinite(times)) else math.inf
 
@@ -116,23 +119,24 @@ def run_chain(
     ]
     sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, target, moves=moves)
     state = emcee.State(_start(target, proposal, walkers, random), random_state=random.get_state())
-    state = sampler.run_mcmc(state, _BURN_IN, skip_initial_state_check=True)
-    burnt = sampler.get_chain(discard=_BURN_IN // 2, flat=True)
-    proposal.update(burnt.mean(axis=0), _blend(np.cov(burnt.T), laplace.covariance))
-    sampler.reset()
+    for _ in range(_BURN_IN_ROUNDS):
+        state = sampler.run_mcmc(state, _BURN_IN_STEPS, skip_initial_state_check=True)
+        burnt = sampler.get_chain(discard=_BURN_IN_STEPS // 2, flat=True)
+        proposal.update(burnt.mean(axis=0), _blend(np.cov(burnt.T), laplace.covariance))
+        sampler.reset()
     tau, steps = math.inf, 0
     while steps < max_steps and steps < AUTOCORRELATION_TIMES * tau:
         state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
         steps = sampler.iteration
         tau = autocorrelation_time(sampler.get_chain())
         if progress is not None:
-            progress(min(1.0, steps / min(max_steps, AUTOCORRELATION_TIMES * tau)))
+            progress(min(1.0, steps / min(float(max_steps), AUTOCORRELATION_TIMES * tau)))
     status: ChainStatus = "converged" if steps >= AUTOCORRELATION_TIMES * tau else "not_converged"
     summary = ChainSummary(
         status=status,
         walkers=walkers,
         steps=steps,
-        burn_in=_BURN_IN,
+        burn_in=_BURN_IN_ROUNDS * _BURN_IN_STEPS,
         tau=tau,
         effective_samples=steps * walkers / tau,
         acceptance=float(np.mean(sampler.acceptance_fraction)),

@@ -29,7 +29,7 @@ class Laplace:
 
 
 def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, high: float = 20.0) -> float:
-    """ln lambda that maximises the evidence of a lens, to 0.01, by Brent's method between ``low`` and ``high``.
+    """Ln lambda that maximises the evidence of a lens, to 0.01, by Brent's method between ``low`` and ``high``.
 
     Raises
     ------
@@ -41,9 +41,7 @@ def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, hig
     values = [target(target.vector(lens, float(s))) for s in grid]
     best = int(np.argmax(values))
     if not math.isfinite(values[best]) or best in (0, grid.size - 1):
-        raise PosteriorError(
-            f"ln lambda: no maximum of the evidence between {low:.1f} and {high:.1f} for {lens}"
-        )
+        raise PosteriorError(f"ln lambda: no maximum of the evidence between {low:.1f} and {high:.1f} for {lens}")
     found = minimize_scalar(
         lambda s: -target(target.vector(lens, float(s))),
         bounds=(grid[best - 1], grid[best + 1]),
@@ -87,9 +85,13 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
     mean = start.copy()
     value = target(mean)
     if not math.isfinite(value):
-        raise PosteriorError(f"start {dict(zip(target.prior.names, start.tolist(), strict=True))}: posterior not finite")
-    root = np.linalg.cholesky(covariance)
-    for done in range(1, _MAX_ROUNDS + 1):
+        raise PosteriorError(
+            f"start {dict(zip(target.prior.names, start.tolist(), strict=True))}: posterior not finite"
+        )
+    root: FloatArray = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    rounds = 0
+    while rounds < _MAX_ROUNDS:
+        rounds += 1
         gradient, hessian = _quadratic_model(target, mean, value, root)
         eigenvalues, vectors = np.linalg.eigh(hessian)
         curvature = np.clip(np.abs(eigenvalues), 0.05, None)
@@ -107,10 +109,10 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
                 break
             step *= 0.4
         root = root @ (vectors / np.sqrt(curvature)) @ vectors.T
-        root = np.linalg.cholesky(root @ root.T)
+        root = np.asarray(np.linalg.cholesky(root @ root.T), dtype=np.float64)
         if gain < 0.02 or (not trial > value and gain < 0.5):
             break
-    return Laplace(mean, root @ root.T, value, done)
+    return Laplace(mean, root @ root.T, value, rounds)
 
 
 def start_covariance(lens_covariance: FloatArray, inflation: float = 4.0) -> FloatArray:

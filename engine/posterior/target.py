@@ -9,10 +9,9 @@ import numpy as np
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError
-from engine.inversion.evidence import Inversion, invert, ln_evidence
+from engine.inversion.evidence import Inversion, SourceModel, invert, ln_evidence
 from engine.inversion.operator import Operator
 from engine.lensing.power_law import PowerLawLens
-from engine.spec import RegularisationName
 
 LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")
 SHEAR_NAMES = ("gamma1", "gamma2")
@@ -40,12 +39,10 @@ def flat_prior(lens: PowerLawLens, ln_lambda: float, *, shear: bool) -> Prior:
     """
     low = [0.7 * lens.theta_E, 0.2, lens.phi - math.pi / 2, 1.3, lens.x - 0.3, lens.y - 0.3]
     high = [1.3 * lens.theta_E, 1.0, lens.phi + math.pi / 2, 2.7, lens.x + 0.3, lens.y + 0.3]
-    names = LENS_NAMES
+    names: tuple[str, ...] = LENS_NAMES
     if shear:
         names, low, high = names + SHEAR_NAMES, [*low, -0.4, -0.4], [*high, 0.4, 0.4]
-    return Prior(
-        (*names, STRENGTH), np.array([*low, ln_lambda - 20.0]), np.array([*high, ln_lambda + 20.0])
-    )
+    return Prior((*names, STRENGTH), np.array([*low, ln_lambda - 20.0]), np.array([*high, ln_lambda + 20.0]))
 
 
 @dataclass
@@ -54,8 +51,7 @@ class Target:
 
     operator: Operator
     prior: Prior
-    shape: tuple[int, int]
-    regularisation: RegularisationName
+    source: SourceModel
     evaluations: int = field(default=0, init=False)
     refused: int = field(default=0, init=False)
 
@@ -68,16 +64,16 @@ class Target:
         return np.array([*(getattr(lens, name) for name in self.prior.names[:-1]), ln_lambda])
 
     def __call__(self, values: FloatArray) -> float:
-        """ln Z + ln prior; minus infinity outside the prior, and where the inversion is refused (counted)."""
+        """Ln Z + ln prior; minus infinity outside the prior, and where the inversion is refused (counted)."""
         if not self.prior.holds(values):
             return -math.inf
         self.evaluations += 1
         try:
-            return ln_evidence(self.operator, self.lens(values), float(values[-1]), self.shape, self.regularisation)
+            return ln_evidence(self.operator, self.lens(values), float(values[-1]), self.source)
         except InversionError:
             self.refused += 1
             return -math.inf
 
     def invert(self, values: FloatArray) -> Inversion:
         """The full inversion at a parameter vector."""
-        return invert(self.operator, self.lens(values), float(values[-1]), self.shape, self.regularisation)
+        return invert(self.operator, self.lens(values), float(values[-1]), self.source)

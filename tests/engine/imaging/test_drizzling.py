@@ -118,9 +118,9 @@ def test_covariance_and_variance_match_noise_draws(f160w):
         rtol=1e-12,
     )
     weights, draws = drizzle_weights(geometry), 3000
-    images = (
-        weights @ (rng.standard_normal((variance.size, draws)) * np.sqrt(variance.ravel())[:, None])
-    ).reshape(*geometry.drizzled_shape, draws)
+    images = (weights @ (rng.standard_normal((variance.size, draws)) * np.sqrt(variance.ravel())[:, None])).reshape(
+        *geometry.drizzled_shape, draws
+    )
     # Averaged over 500 pixels x 3000 draws the mean variance is known to about 0.3 %; asked for are 2 %.
     assert images.var(axis=2).sum() == pytest.approx(covariance.diagonal().sum(), rel=0.01)
     ny, nx = geometry.drizzled_shape

@@ -41,9 +41,7 @@ def test_oversampling_that_the_dither_cannot_use_is_refused(f160w):
 def test_point_source_has_its_flux_and_place(setup):
     geometry, rng = setup.geometry, np.random.default_rng(1)
     x, y = geometry.high_resolution_axes()
-    own = centroid(
-        setup.psf, *([(np.arange(len(setup.psf)) - len(setup.psf) // 2) * geometry.subpixel_scale] * 2)
-    )
+    own = centroid(setup.psf, *([(np.arange(len(setup.psf)) - len(setup.psf) // 2) * geometry.subpixel_scale] * 2))
     for position in rng.uniform(-0.2, 0.2, (5, 2)):
         image = point_source_image(position, 3.0, setup.psf, geometry)
         assert image.sum() == pytest.approx(3.0 * setup.psf.sum(), rel=1e-12)  # asked: 1e-6
@@ -64,9 +62,7 @@ def test_point_source_is_the_psf_integrated_over_the_subpixels(f160w):
     assert ny % 2 == 1
     assert nx % 2 == 1
     middle, half = len(fine) // 2, 4
-    blocks = fine[
-        middle - 4 - 9 * half : middle + 5 + 9 * half, middle - 4 - 9 * half : middle + 5 + 9 * half
-    ]
+    blocks = fine[middle - 4 - 9 * half : middle + 5 + 9 * half, middle - 4 - 9 * half : middle + 5 + 9 * half]
     expected = blocks.reshape(2 * half + 1, 9, 2 * half + 1, 9).sum(axis=(1, 3))
     got = image[ny // 2 - half : ny // 2 + half + 1, nx // 2 - half : nx // 2 + half + 1]
     # The midpoint rule on 9 points a side is wrong by a^2 / (12 sigma^2 81) = 4e-4 of the peak, for
@@ -94,10 +90,7 @@ def test_convolution_equals_the_direct_sum_and_does_not_wrap(f160w):
     big = rng.random((41, 41))
     expected = np.array(
         [
-            [
-                sum(image[j, i] * big[20 + y - j, 20 + x - i] for j in range(17) for i in range(12))
-                for x in range(12)
-            ]
+            [sum(image[j, i] * big[20 + y - j, 20 + x - i] for j in range(17) for i in range(12)) for x in range(12)]
             for y in range(17)
         ]
     )
@@ -123,9 +116,7 @@ def test_extended_light_and_a_swarm_of_stars_give_the_same_exposures(f160w):
 
 def test_exposures_conserve_flux_and_are_centred(setup):
     geometry = setup.geometry
-    own = centroid(
-        setup.psf, *([(np.arange(len(setup.psf)) - len(setup.psf) // 2) * geometry.subpixel_scale] * 2)
-    )
+    own = centroid(setup.psf, *([(np.arange(len(setup.psf)) - len(setup.psf) // 2) * geometry.subpixel_scale] * 2))
     position = np.array([0.111, -0.067])
     exposures = expose(point_source_image(position, 1.0, setup.psf, geometry), geometry, setup.kernel)
     np.testing.assert_allclose(exposures.sum(axis=(1, 2)), setup.psf.sum(), rtol=1e-12)

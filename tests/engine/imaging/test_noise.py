@@ -45,9 +45,7 @@ def test_every_system_of_the_catalogue_has_positive_noise():
     for name in ("HE0435", "HE1104", "SDSS1206", "WFI2033", "HE0047", "SDSS0246", "HS2209", "RXJ1131"):
         system = load_system(name)
         for level in ("author", "handbook"):
-            noise = exposure_variance(
-                np.array([-1e-9, 0, 1e3]), load_camera(system.camera), system.exposures, level
-            )
+            noise = exposure_variance(np.array([-1e-9, 0, 1e3]), load_camera(system.camera), system.exposures, level)
             assert (noise.variance > 0).all()
 
 

@@ -34,9 +34,7 @@ def effective(camera_name):
     camera = load_camera(camera_name)
     # 5 arcsec hold all radii of the tables that are compared; a larger stamp has the same values there.
     psf = telescope_psf(camera, field_of_view=5.0)
-    return effective_psf(
-        psf, camera.oversampling, detector_kernel(camera)
-    ), camera.pixel_scale / camera.oversampling
+    return effective_psf(psf, camera.oversampling, detector_kernel(camera)), camera.pixel_scale / camera.oversampling
 
 
 @pytest.mark.parametrize(("camera_name", "table", "bound"), EE_TABLES)
@@ -61,9 +59,7 @@ def test_fwhm_matches_the_handbook_within_the_measured_residual(camera_name, cap
     wanted = read_catalogue("cameras")["cameras"][camera_name]["fwhm_arcsec"]["value"]
     got = full_width_half_maximum(psf, scale)
     with capsys.disabled():
-        print(
-            f"\n{camera_name} FWHM: table {wanted:.3f}, model {got:.4f}, residual {got - wanted:+.4f} arcsec"
-        )
+        print(f"\n{camera_name} FWHM: table {wanted:.3f}, model {got:.4f}, residual {got - wanted:+.4f} arcsec")
     assert abs(got - wanted) < FWHM[camera_name]
 
 

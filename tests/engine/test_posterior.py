@@ -1,0 +1,122 @@
+"""Optimum and chain on targets whose answer is known, and their failures."""
+
+import math
+
+import numpy as np
+import pytest
+
+from engine.errors import PosteriorError
+from engine.inversion.evidence import SourceModel
+from engine.posterior.chain import autocorrelation_time, run_chain
+from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
+from engine.posterior.target import Prior, Target, flat_prior
+from tests.engine.dense_oracle import LENS, Case
+
+
+class Gaussian:
+    """A stand-in for the evidence with a known answer: the sampler cannot tell."""
+
+    def __init__(self, dimensions: int = 5) -> None:
+        rng = np.random.default_rng(0)
+        root = rng.normal(size=(dimensions, dimensions)) + 2 * np.eye(dimensions)
+        self.covariance = root @ root.T
+        self.mean = rng.normal(size=dimensions)
+        self.inverse = np.linalg.inv(self.covariance)
+        self.prior = Prior(tuple("abcdefgh"[:dimensions]), self.mean - 1e3, self.mean + 1e3)
+        self.evaluations = 0
+
+    def __call__(self, values: np.ndarray) -> float:
+        self.evaluations += 1
+        away = values - self.mean
+        return float(-0.5 * away @ self.inverse @ away)
+
+
+def test_the_optimum_of_a_gaussian_is_found_with_its_covariance() -> None:
+    target = Gaussian()
+    start = target.mean + 3.0
+    laplace = find_optimum(target, start, np.eye(5))
+    assert np.allclose(laplace.mean, target.mean, atol=1e-6)
+    assert np.allclose(laplace.covariance, target.covariance, rtol=1e-5)
+
+
+def test_the_chain_samples_a_gaussian_from_a_poor_approximation() -> None:
+    target = Gaussian()
+    poor = Laplace(target.mean + 0.5 * np.sqrt(np.diag(target.covariance)), 2.0 * target.covariance, 0.0, 1)
+    chain = run_chain(target, poor, walkers=20, max_steps=1500, rng=np.random.default_rng(1))
+    assert chain.summary.status == "converged"
+    flat = chain.flat()
+    sd = np.sqrt(np.diag(target.covariance))
+    error = 1.0 / math.sqrt(chain.summary.effective_samples)
+    # Five standard errors of the mean, and of the deviation, for the effective number of samples.
+    assert np.abs((flat.mean(axis=0) - target.mean) / sd).max() < 5 * error
+    assert np.abs(flat.std(axis=0) / sd - 1).max() < 5 * error
+    assert chain.summary.effective_samples > 200
+
+
+def test_a_chain_that_is_too_short_says_so() -> None:
+    target = Gaussian()
+    chain = run_chain(
+        target, Laplace(target.mean, target.covariance, 0.0, 1), walkers=20, max_steps=20, rng=np.random.default_rng(1)
+    )
+    assert chain.summary.status == "not_converged"
+    assert chain.summary.steps == 20
+
+
+def test_the_same_seed_gives_the_same_chain() -> None:
+    chains = []
+    for _ in range(2):
+        target = Gaussian()
+        laplace = Laplace(target.mean, target.covariance, 0.0, 1)
+        chains.append(run_chain(target, laplace, walkers=20, max_steps=30, rng=np.random.default_rng(5)))
+    assert np.array_equal(chains[0].samples, chains[1].samples)
+
+
+def test_thinned_states_are_states_of_the_chain_and_spread_over_it() -> None:
+    target = Gaussian()
+    laplace = Laplace(target.mean, target.covariance, 0.0, 1)
+    chain = run_chain(target, laplace, walkers=20, max_steps=60, rng=np.random.default_rng(5))
+    states = chain.thinned(30, np.random.default_rng(0))
+    assert states.shape == (30, 5)
+    steps = [int(np.argwhere((chain.samples == state).all(axis=2))[0][0]) for state in states]
+    assert min(steps) == 0
+    assert len(set(steps)) > 20
+
+
+def test_the_autocorrelation_time_of_independent_samples_is_one() -> None:
+    samples = np.random.default_rng(0).normal(size=(2000, 8, 2))
+    assert autocorrelation_time(samples) == pytest.approx(1.0, abs=0.1)
+    assert autocorrelation_time(np.zeros((10, 4, 2))) == math.inf
+
+
+def test_the_strength_that_maximises_the_evidence_is_found() -> None:
+    operator = Case(amplitudes=1).operator()
+    target = Target(operator, flat_prior(LENS, 0.0, shear=True), SourceModel((9, 9)))
+    best = optimal_strength(target, LENS)
+    values = [target(target.vector(LENS, best + step)) for step in (-0.3, 0.0, 0.3)]
+    assert values[1] > max(values[0], values[2])
+
+
+def test_a_strength_without_a_maximum_is_refused() -> None:
+    operator = Case(amplitudes=1).operator()
+    target = Target(operator, flat_prior(LENS, 0.0, shear=True), SourceModel((9, 9)))
+    best = optimal_strength(target, LENS)
+    with pytest.raises(PosteriorError, match="ln lambda"):
+        optimal_strength(target, LENS, low=best + 3.0, high=best + 9.0)
+
+
+def test_outside_the_prior_nothing_is_evaluated() -> None:
+    target = Target(Case().operator(), flat_prior(LENS, 0.0, shear=True), SourceModel((6, 6)))
+    outside = target.vector(LENS, 0.0)
+    outside[1] = 1.2
+    assert target(outside) == -math.inf
+    assert target.evaluations == 0
+    with pytest.raises(PosteriorError, match="start"):
+        find_optimum(target, outside, start_covariance(np.eye(8) * 1e-4))
+
+
+def test_a_lens_without_shear_has_no_shear_parameters() -> None:
+    plain = LENS.with_values(gamma1=0.0, gamma2=0.0)
+    prior = flat_prior(plain, 0.0, shear=False)
+    assert prior.names == ("theta_E", "q", "phi", "slope", "x", "y", "ln_lambda")
+    target = Target(Case().operator(), prior, SourceModel((6, 6)))
+    assert target.lens(target.vector(plain, 0.0)) == plain

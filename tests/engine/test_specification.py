@@ -1,0 +1,203 @@
+"""Specifications, the catalogue and grids: what is accepted, what is refused and how it is told."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from engine.catalogue import (
+    camera_names,
+    load_camera,
+    load_dither,
+    load_system,
+    read_catalogue,
+    system_facts,
+    system_names,
+)
+from engine.conventions import (
+    image_angle,
+    intermediate_einstein_radius,
+    magnitude_to_rate,
+    paper_einstein_radius,
+    position_angle,
+    rate_to_magnitude,
+)
+from engine.digest import engine_digest
+from engine.errors import SpecError
+from engine.grid import Grid, expand, preset_names
+from engine.scene import build_scene
+from engine.spec import Analysis, Host, Realization, realization_from_dict
+
+HE0435 = Realization(system="HE0435", l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=21.0))
+
+
+def test_all_eight_systems_and_three_cameras_load() -> None:
+    assert system_names() == (
+        "HE0435",
+        "HE1104",
+        "SDSS1206",
+        "WFI2033",
+        "HE0047",
+        "SDSS0246",
+        "HS2209",
+        "RXJ1131",
+    )
+    assert len(camera_names()) == 3
+    for name in system_names():
+        system = load_system(name)
+        assert load_camera(system.camera).name == system.camera
+        assert load_dither(system.exposures.dither).shifts
+        for l_eta in (0.8, 1.0, 1.2):
+            assert system.mass_model("recommended", l_eta).slope == pytest.approx(1.0 + l_eta)
+
+
+def test_every_number_of_the_catalogue_has_a_source_and_a_confidence() -> None:
+    for name in system_names():
+        facts = system_facts(name)
+        groups = [facts[key] for key in ("redshift_lens", "redshift_source", "table1", "agn", "deflector", "exposures")]
+        groups += [model for by_slope in facts["mass_models"].values() for model in by_slope.values()]
+        for group in groups:
+            assert group["source"]
+            assert group["confidence"] in {"published", "derived", "memory"}
+
+
+def test_the_papers_grid_has_48_runs_a_system_numbered_as_in_table_3() -> None:
+    runs = expand(Grid(preset="h0licow-vi/HE0435"))
+    assert [run.paper_run for run in runs] == list(range(1, 49))
+    table3 = {1: (2, 0.39, 0.8), 4: (4, 0.78, 0.8), 6: (4, 0.39, 1.0), 11: (2, 0.78, 1.2), 12: (4, 0.78, 1.2)}
+    for serial, (n, r_eff, l_eta) in table3.items():
+        for brightness, magnitude in enumerate((20.5, 21.0, 21.5, 22.0)):
+            spec = runs[12 * brightness + serial - 1].realization
+            assert (spec.host.n, spec.host.r_eff, spec.l_eta, spec.host.magnitude) == (n, r_eff, l_eta, magnitude)
+    assert len(expand(Grid(preset="h0licow-vi"))) == 8 * 48
+    assert len({run.realization.digest for run in expand(Grid(preset="h0licow-vi"))}) == 384
+    assert "h0licow-vi/RXJ1131" in preset_names()
+
+
+def test_the_numbering_is_data() -> None:
+    table = read_catalogue("h0licow_vi")
+    assert len(table["runs"]) == 48
+    assert len(table["serials"]) == 12
+
+
+def test_cuts_and_replicates() -> None:
+    grid = Grid(
+        preset="h0licow-vi/HE0435", n=(2.0, 4.0), magnitude=(20.5, 21.5), l_eta=(1.0,), r_eff=(0.39,), replicates=2
+    )
+    runs = expand(grid)
+    assert [run.label for run in runs] == [f"HE0435/{k:02d}#{j}" for k in (5, 6, 29, 30) for j in (1, 2)]
+    assert {run.realization.seed for run in runs} == {0, 1}
+
+
+def test_a_free_grid_has_every_combination() -> None:
+    grid = Grid(systems=("HE0435", "RXJ1131"), n=(1.0,), r_eff=(0.2, 0.3), magnitude=(21.0,), l_eta=(0.8, 1.2))
+    assert len(expand(grid)) == 8
+
+
+@pytest.mark.parametrize(
+    ("grid", "field"),
+    [
+        (Grid(preset="nothing"), "preset"),
+        (Grid(preset="h0licow-vi/HE0435", n=(3.0,)), "n"),
+        (Grid(preset="h0licow-vi/HE0435", magnitude=()), "magnitude"),
+        (Grid(preset="h0licow-vi/HE0435", systems=("RXJ1131",)), "systems"),
+        (Grid(systems=("HE0435",), n=(2.0,)), "r_eff"),
+        (Grid(systems=("nowhere",), n=(2.0,), r_eff=(0.4,), magnitude=(21.0,), l_eta=(1.0,)), "system"),
+        (Grid(systems=("HE0435",), n=(2.0,), r_eff=(0.4,), magnitude=(21.0,), l_eta=(0.9,)), "l_eta"),
+        (Grid(systems=("HE0435",), n=(2.0, 2.0), r_eff=(0.4,), magnitude=(21.0,), l_eta=(1.0,)), "n"),
+        (Grid(preset="h0licow-vi/HE0435", mass_model="dark"), "mass_model"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused_by_field(grid: Grid, field: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        expand(grid)
+    assert caught.value.field == field
+    assert caught.value.allowed
+
+
+def test_a_realization_survives_json_and_keeps_its_digest() -> None:
+    again = realization_from_dict(json.loads(json.dumps(HE0435.to_dict())))
+    assert again == HE0435
+    assert again.digest == HE0435.digest
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"host": {"n": 99, "r_eff": 0.4, "magnitude": 21}}, "host.n"),
+        ({"host": {"n": 2, "r_eff": float("nan"), "magnitude": 21}}, "host.r_eff"),
+        ({"l_eta": 7.0}, "l_eta"),
+        ({"seed": -1}, "seed"),
+        ({"noise_level": "none"}, "noise_level"),
+        ({"unheard_of": 1}, "unheard_of"),
+        ({"analysis": {"source_pixels": [1, 30]}}, "analysis.source_pixels.0"),
+    ],
+)
+def test_a_bad_realization_is_refused_by_field(change: dict[str, object], field: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        realization_from_dict(HE0435.to_dict() | change)
+    assert caught.value.field == field
+
+
+def test_another_seed_or_setting_is_another_realization() -> None:
+    others = [
+        Realization(system="HE0435", l_eta=1.0, host=HE0435.host, seed=1),
+        Realization(system="HE0435", l_eta=1.0, host=HE0435.host, analysis=Analysis(subrays=3)),
+        Realization(system="HE0435", l_eta=1.0, host=HE0435.host, noise_level="handbook"),
+    ]
+    assert len({HE0435.digest, *(other.digest for other in others)}) == 4
+
+
+def test_a_system_of_ones_own_runs_like_one_of_the_catalogue() -> None:
+    own = Realization(system=load_system("HE0435"), l_eta=1.0, host=HE0435.host)
+    assert realization_from_dict(own.to_dict()) == own
+    assert build_scene(own).agn == build_scene(HE0435).agn
+
+
+def test_the_scene_turns_sky_into_image_once() -> None:
+    scene = build_scene(HE0435)
+    mass = load_system("HE0435").mass_model("recommended", 1.0)
+    assert (scene.host.x, scene.host.y) == (-mass.source_position[0], mass.source_position[1])
+    assert position_angle(scene.lens.phi) == pytest.approx(mass.position_angle)
+    # Image A lies to the East (x_image < 0) and North, and is the brightest.
+    by_name = {source.name: source for source in scene.agn}
+    assert by_name["A"].x < -1.0
+    assert by_name["A"].y > 0.4
+    assert max(scene.agn, key=lambda source: source.flux).name == "A"
+    assert scene.host.flux == pytest.approx(10 ** (0.4 * (25.9463 - 21.0)))
+
+
+def test_a_wrong_number_of_agn_images_is_refused() -> None:
+    system = load_system("HE0435")
+    wrong = Realization(system=type(system)(**{**system.__dict__, "agn": system.agn[:3]}), l_eta=1.0, host=HE0435.host)
+    with pytest.raises(SpecError, match="agn"):
+        build_scene(wrong)
+
+
+@given(angle=st.floats(0, 179.99))
+def test_position_angles_go_there_and_back(angle: float) -> None:
+    difference = abs(position_angle(image_angle(angle)) - angle)
+    assert min(difference, 180 - difference) < 1e-9
+
+
+@given(q=st.floats(0.2, 1.0), slope=st.floats(1.3, 2.7))
+def test_einstein_radii_of_both_conventions_go_there_and_back(q: float, slope: float) -> None:
+    assert intermediate_einstein_radius(paper_einstein_radius(1.3, q, slope), q, slope) == pytest.approx(1.3)
+
+
+def test_the_papers_einstein_radius_is_seven_percent_off_at_q_0_6() -> None:
+    # ENGINE.md gives 'up to 7 % apart at q = 0.6': eta = 0.8 ... 1.2 there.
+    ratios = [paper_einstein_radius(1.0, 0.6, slope) for slope in (1.8, 2.0, 2.2)]
+    assert max(abs(ratio - 1) for ratio in ratios) == pytest.approx(0.072, abs=0.005)
+
+
+def test_magnitudes_and_rates_go_there_and_back() -> None:
+    assert rate_to_magnitude(magnitude_to_rate(21.3, 25.9463), 25.9463) == pytest.approx(21.3)
+    with pytest.raises(ValueError, match="rate"):
+        rate_to_magnitude(0.0, 25.9)
+
+
+def test_the_engine_digest_is_a_sha256_and_stays() -> None:
+    assert len(engine_digest()) == 64
+    assert engine_digest() == engine_digest()
