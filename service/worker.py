@@ -34,7 +34,7 @@ def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, A
         return {
             "error": {
                 "code": _error_code(error),
-                "message": f"{type(error).__name__}: {error}"[:2000],
+                "message": "".join(traceback.format_exception_only(error)).strip()[:2000],
                 "permanent": _is_permanent(error),
             }
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from typing import Any
 
 from distributed import KilledWorker
@@ -34,9 +35,11 @@ def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure:
 
 def read_exception(error: BaseException) -> Failure:
     """What Dask's own failure to run a run means for it."""
-    text = clean(f"{type(error).__name__}: {error}")
     if isinstance(error, KilledWorker):
+        text = "the worker died while it ran this"
         return Failure(Outcome.WORKER_LOST, "worker_lost", text, WORKER_LOST_RETRIES, suspect=True)
+    # Not str(error): that calls code of whatever library raised it, which may raise itself.
+    text = clean("".join(traceback.format_exception_only(error)).strip())
     return Failure(Outcome.ERROR, "task_error", text, ERROR_RETRIES)
 
 

@@ -130,7 +130,9 @@ def test_results_summary_and_figure_of_a_finished_grid(api: TestClient, settings
     assert (row["input"]["magnitude"], row["n_runs"]) == (20.5, 3)
     assert "seed" not in row["input"]
     for name in ESTIMATES:
-        means = [run["result"]["estimates"][name]["magnitude"]["mean"] for run in runs if run["inputs"]["magnitude"] == 20.5]
+        means = [
+            run["result"]["estimates"][name]["magnitude"]["mean"] for run in runs if run["inputs"]["magnitude"] == 20.5
+        ]
         found = row["estimates"][name]["magnitude"]
         mean = sum(means) / 3
         assert found["input"] == 20.5
@@ -307,7 +309,9 @@ def test_a_large_body_is_refused(refusing: TestClient) -> None:
         ("/", 404, None),
     ],
 )
-def test_a_bad_address_is_refused_politely(refusing: TestClient, address: str, status: int, pointer: str | None) -> None:
+def test_a_bad_address_is_refused_politely(
+    refusing: TestClient, address: str, status: int, pointer: str | None
+) -> None:
     assert_problem(refusing.get(address), status, pointer)
 
 

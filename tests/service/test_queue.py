@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import pytest
 from sqlalchemy import func, select
@@ -18,6 +21,22 @@ from service.store.states import GridState, RunState
 from service.store.tables import event, result, run
 from tests.service.conftest import Clock
 from tests.service.plans import body, planned, result_of, submit
+
+T = TypeVar("T")
+
+
+def at_once(work: Callable[..., T], arguments: Iterable[Any]) -> list[T]:
+    """Call ``work`` from as many threads at one moment as there are arguments."""
+    each = list(arguments)
+    barrier = threading.Barrier(len(each))
+
+    def start(argument: Any) -> T:
+        barrier.wait()
+        return work(argument)
+
+    with ThreadPoolExecutor(len(each)) as threads:
+        return list(threads.map(start, each))
+
 
 ERROR = Failure(Outcome.ERROR, "error", "it broke", retries=2)
 PERMANENT = Failure(Outcome.ERROR, "invalid_spec", "never", retries=0)
@@ -72,25 +91,17 @@ def test_four_dispatching_threads_claim_each_run_once(
     url: str, grids: GridStore, generation: int, clock: Clock
 ) -> None:
     submit(grids, 120)
-    claimed: list[str] = []
-    errors: list[BaseException] = []
 
-    def work() -> None:
+    def work(_: int) -> list[str]:
         database = Database(url)
         mine = RunQueue(database, clock)
-        try:
-            while leases := mine.claim(generation, 3):
-                claimed.extend(lease.run_id for lease in leases)
-        except BaseException as error:
-            errors.append(error)
+        claimed = []
+        while leases := mine.claim(generation, 3):
+            claimed += [lease.run_id for lease in leases]
         database.close()
+        return claimed
 
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not errors
+    claimed = [run_id for some in at_once(work, range(4)) for run_id in some]
     # SKIP LOCKED may let a claimer leave while another still holds rows: what is claimed is claimed once all the same.
     assert set(Counter(claimed).values()) == {1}
     assert len(claimed) == 120
@@ -146,20 +157,14 @@ def test_two_stores_with_one_lease_at_the_same_time_store_once(
     submit(grids, 1)
     lease = one(queue, generation)
     payload = result_of(lease)
-    barrier = threading.Barrier(4)
-    outcomes: list[Stored] = []
 
-    def work() -> None:
+    def work(_: int) -> Stored:
         mine = Database(url)
-        barrier.wait()
-        outcomes.append(RunQueue(mine, clock).store(lease, payload))
+        stored = RunQueue(mine, clock).store(lease, payload)
         mine.close()
+        return stored
 
-    threads = [threading.Thread(target=work) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    outcomes = at_once(work, range(4))
     assert Counter(outcomes) == {Stored.STORED: 1, Stored.STALE_SAME: 3}
     assert results(database) == 1
 
@@ -167,22 +172,14 @@ def test_two_stores_with_one_lease_at_the_same_time_store_once(
 def test_the_last_two_runs_ending_at_once_finish_the_grid(
     url: str, grids: GridStore, queue: RunQueue, generation: int, clock: Clock
 ) -> None:
+    def work(lease: Lease) -> None:
+        mine = Database(url)
+        RunQueue(mine, clock).store(lease, result_of(lease))
+        mine.close()
+
     for repetition in range(5):
         grid_id = submit(grids, 2, seed=10 * repetition)
-        leases = queue.claim(generation, 2)
-        barrier = threading.Barrier(2)
-
-        def work(lease: Lease, barrier: threading.Barrier = barrier) -> None:
-            mine = Database(url)
-            barrier.wait()
-            RunQueue(mine, clock).store(lease, result_of(lease))
-            mine.close()
-
-        threads = [threading.Thread(target=work, args=(lease,)) for lease in leases]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        at_once(work, queue.claim(generation, 2))
         assert grids.grid(grid_id).state is GridState.DONE
 
 
@@ -233,9 +230,7 @@ def test_a_run_handed_back_is_charged_nothing_and_keeps_its_place(
     assert queue.fail(one(queue, generation), ERROR) is RunState.QUEUED
 
 
-def test_runs_that_the_dispatcher_does_not_know_of_go_back(
-    grids: GridStore, queue: RunQueue, generation: int
-) -> None:
+def test_runs_that_the_dispatcher_does_not_know_of_go_back(grids: GridStore, queue: RunQueue, generation: int) -> None:
     submit(grids, 3)
     known, *unknown = queue.claim(generation, 3)
     assert queue.requeue_forgotten(generation, [known.run_id]) == [lease.run_id for lease in unknown]
@@ -329,20 +324,14 @@ def test_a_grid_is_stored_whole_or_not_at_all(database: Database, grids: GridSto
 
 
 def test_many_submissions_with_one_key_make_one_grid(url: str, grids: GridStore, clock: Clock) -> None:
-    made: list[str] = []
-    barrier = threading.Barrier(8)
 
-    def work() -> None:
+    def work(_: int) -> str:
         mine = Database(url)
-        barrier.wait()
-        made.append(GridStore(mine, clock).create(body(3), lambda: planned(3), key="k").grid.id)
+        made = GridStore(mine, clock).create(body(3), lambda: planned(3), key="k").grid.id
         mine.close()
+        return made
 
-    threads = [threading.Thread(target=work) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    made = at_once(work, range(8))
     assert len(made) == 8
     assert len(set(made)) == 1
     assert len(grids.grids(10).items) == 1
@@ -372,9 +361,7 @@ def test_pages_show_each_thing_once(grids: GridStore, clock: Clock) -> None:
         grids.runs("g_" + "0" * 26, 3)
 
 
-def test_rate_and_time_left_follow_the_runs(
-    grids: GridStore, queue: RunQueue, generation: int, clock: Clock
-) -> None:
+def test_rate_and_time_left_follow_the_runs(grids: GridStore, queue: RunQueue, generation: int, clock: Clock) -> None:
     grid_id = submit(grids, 6)
     clock.advance(1000)
     assert grids.grid(grid_id).rate_per_s is None
@@ -389,27 +376,18 @@ def test_rate_and_time_left_follow_the_runs(
     assert grid.eta_seconds == pytest.approx(10)
 
 
-def test_a_hundred_immediate_writers_never_find_sqlite_locked(sqlite_url: str, clock: Clock) -> None:
+def test_four_writers_at_once_never_find_sqlite_locked(sqlite_url: str, clock: Clock) -> None:
     grids = GridStore(Database(sqlite_url), clock)
     Leadership(Database(sqlite_url), 30.0, clock).take("first")
-    errors: list[BaseException] = []
 
     def work(number: int) -> None:
         mine = Database(sqlite_url)
         queue = RunQueue(mine, clock)
-        try:
-            for repetition in range(25):
-                submit(GridStore(mine, clock), 1, seed=100 * number + repetition)
-                for lease in queue.claim(1, 2):
-                    queue.store(lease, result_of(lease))
-        except BaseException as error:
-            errors.append(error)
+        for repetition in range(25):
+            submit(GridStore(mine, clock), 1, seed=100 * number + repetition)
+            for lease in queue.claim(1, 2):
+                queue.store(lease, result_of(lease))
         mine.close()
 
-    threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert errors == []
+    at_once(work, range(4))
     assert sum(grid.counts.done for grid in grids.grids(1000).items) == 100

@@ -6,8 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 import schemathesis
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis.errors import Unsatisfiable
 from schemathesis.checks import not_a_server_error
+from schemathesis.generation import GenerationMode
 from schemathesis.specs.openapi.checks import (
     content_type_conformance,
     response_schema_conformance,
@@ -41,17 +43,35 @@ def schema(tmp_path_factory: pytest.TempPathFactory) -> Iterator[schemathesis.sc
     Database(own.database).close()
 
 
-lazy = schemathesis.pytest.from_fixture("schema")
-
-
-@lazy.parametrize()
-@settings(
-    max_examples=25,
+CASES = settings(
+    max_examples=50,
     deadline=None,
     derandomize=True,
     database=None,
     phases=[Phase.explicit, Phase.generate],
     suppress_health_check=list(HealthCheck),
 )
-def test_no_request_that_fits_or_breaks_the_schema_gives_a_5xx(case: schemathesis.Case) -> None:
-    case.call_and_validate(checks=CHECKS)
+
+
+@pytest.mark.parametrize("mode", list(GenerationMode))
+def test_no_request_that_fits_or_breaks_the_schema_gives_a_5xx(
+    schema: schemathesis.schemas.BaseSchema, mode: GenerationMode
+) -> None:
+    tried = 0
+    for found in schema.get_all_operations():
+        operation = found.ok()
+
+        @CASES
+        @given(case=operation.as_strategy(generation_mode=mode))
+        def try_it(case: schemathesis.Case) -> None:
+            nonlocal tried
+            tried += 1
+            case.call_and_validate(checks=CHECKS)
+
+        try:
+            try_it()
+        except Unsatisfiable:
+            # Nothing can break an operation without parameters.
+            assert mode is GenerationMode.NEGATIVE
+    print(f"{tried} requests")
+    assert tried > 100
