@@ -81,7 +81,10 @@ def serve(
     logging.getLogger("alembic").setLevel(logging.WARNING)
     settings = _settings(host=host, port=port, workers=workers, data_dir=data_dir)
     address = f"http://{settings.host}:{settings.port}"
-    supervise(settings, lambda: _console().print(f"hostlens serves {address}; Ctrl-C ends it", highlight=False))
+    try:
+        supervise(settings, lambda: _console().print(f"hostlens serves {address}; Ctrl-C ends it", highlight=False))
+    except OSError as error:
+        _fail(f"cannot serve {address}: {error}")
 
 
 @app.command()

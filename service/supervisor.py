@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -158,11 +159,23 @@ def _as_environment(settings: Settings) -> dict[str, str]:
     return {f"HOSTLENS_{name.upper()}": str(value) for name, value in values.items()}
 
 
+def require_free(settings: Settings) -> None:
+    """Ask for the port before anything is started; OSError where another process has it.
+
+    Otherwise the API would be started again and again beside the one that is already there.
+    """
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((settings.host, settings.port))
+
+
 def serve(settings: Settings, started: Callable[[], None] = lambda: None) -> None:
-    """Run API and dispatcher until SIGINT or SIGTERM."""
+    """Run API and dispatcher until SIGINT or SIGTERM; OSError where the port is taken."""
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    require_free(settings)
     supervisor = Supervisor(settings)
     supervisor.prepare()
     supervisor.run(stop, started)

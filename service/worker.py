@@ -6,6 +6,7 @@ has not installed would not unpickle there.
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import logging
 import traceback
@@ -66,31 +67,15 @@ def _figure(result: RunResult) -> bytes:
 
 
 def _products(result: RunResult, artefacts: ArtefactStore) -> ArtefactPayload | None:
+    """Every array and number of the products as NPZ, under the names that the engine gives them."""
     if result.products is None:
         return None
     numpy = import_module("numpy")
-    products = result.products
-    names = (
-        "image",
-        "noise",
-        "model",
-        "arc_model",
-        "residual",
-        "mask",
-        "source",
-        "source_sd",
-        "source_truth",
-    )
-    arrays = {name: getattr(products, name) for name in names if getattr(products, name) is not None}
+    values = {field.name: getattr(result.products, field.name) for field in dataclasses.fields(result.products)}
+    arrays = {name: numpy.asarray(value) for name, value in values.items() if value is not None}
     data = io.BytesIO()
-    numpy.savez_compressed(
-        data,
-        chain=products.chain,
-        parameter_names=numpy.array(products.parameter_names),
-        pixel_scale=products.pixel_scale,
-        source_extent=products.source_extent,
-        **arrays,
-    )
+    # Objects would be pickled, and nobody should have to unpickle a file to read it.
+    numpy.savez_compressed(data, **{name: array for name, array in arrays.items() if array.dtype != object})
     return artefacts.put(data.getvalue(), "npz")
 
 

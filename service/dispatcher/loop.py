@@ -7,6 +7,7 @@ import queue as queues
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from threading import Event
@@ -70,7 +71,7 @@ class Dispatcher:
 
     def hand_back(self) -> None:
         """Write what has ended, give the rest back to the queue, uncharged."""
-        self._collect(wait=False)
+        self._collect(0.001)
         self._write_endings()
         leases = [flight.lease for flight in self._flights.values()]
         self._flights.clear()
@@ -79,32 +80,32 @@ class Dispatcher:
 
     def _step(self) -> None:
         self._write_endings()
-        started = self._fill()
-        self._collect(wait=not started)
+        self._fill()
+        # With every worker busy there is nothing to look for in the queue until one of them is done.
+        busy = len(self._flights) >= self._pool.threads() > 0
+        self._collect(_CANCEL_LOOK_S if busy else self._settings.poll_s)
         self._write_endings()
         if self._is_due("cancel", _CANCEL_LOOK_S) and self._flights:
             self._stop_cancelled()
         if self._is_due("reconcile", self._settings.reconcile_s):
             self._reconcile()
 
-    def _fill(self) -> int:
+    def _fill(self) -> None:
         """Claim and submit as many runs as there is room for."""
         threads = self._pool.threads()
         self._heartbeat.workers = threads
         room = min(self._settings.window or threads, threads) - len(self._flights)
         if room <= 0 or not self._queue.waiting():
-            return 0
-        leases = self._queue.claim(self._generation, room)
-        for lease in leases:
+            return
+        for lease in self._queue.claim(self._generation, room):
             key = lease.key
             future = self._pool.submit(lease, lambda _, key=key: self._done.put(key))  # type: ignore[misc]
             self._flights[key] = _Flight(lease, future, time.monotonic())
-        return len(leases)
 
-    def _collect(self, *, wait: bool) -> None:
-        """Turn runs that Dask has ended into endings; ``wait`` a moment for the first."""
+    def _collect(self, wait_s: float) -> None:
+        """Turn runs that Dask has ended into endings, waiting for the first of them."""
         try:
-            self._land(self._done.get(timeout=self._settings.poll_s if wait else 0.001))
+            self._land(self._done.get(timeout=wait_s))
             while True:
                 self._land(self._done.get_nowait())
         except queues.Empty:
@@ -121,6 +122,8 @@ class Dispatcher:
         else:
             try:
                 ending = read_answer(lease, flight.future.result(timeout=_GATHER_S))
+            except (OSError, TimeoutError, CancelledError):
+                return  # the worker went before its answer was fetched: the reconciliation finds out what is left
             except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
                 ending = read_exception(error)
         del self._flights[key]

@@ -7,16 +7,19 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from distributed import KilledWorker
 from fastapi.testclient import TestClient
+from matplotlib.figure import Figure
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from engine.result import ChainSummary, Estimate, LensParameter, Quantity, RunResult, StageTime
-from engine.spec import Analysis
+from engine.spec import Analysis, realization_from_dict
 from service.api.app import create_app
 from service.artefacts import ArtefactStore
 from service.cli import app
@@ -28,7 +31,7 @@ from service.requests import AnalysisRequest
 from service.settings import Settings
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
-from service.worker import call_task
+from service.worker import call_task, execute
 from tests.service.plans import planned
 from tests.service.tasks import PNG, synthetic_payload
 
@@ -179,3 +182,28 @@ def test_the_command_line_says_so_when_there_is_no_service() -> None:
     outcome = CliRunner().invoke(app, ["status", "--url", "http://127.0.0.1:1"])
     assert outcome.exit_code == 1
     assert "does not answer" in outcome.output
+
+
+def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flat = np.zeros((4, 5))
+    values = {"image": flat, "model": flat, "source_truth": None, "names": ("a", "b")}
+    products = dataclasses.make_dataclass("Products", list(values))(**values)
+    digest = planned(1)[0].digest
+    engine = SimpleNamespace(
+        realization_from_dict=realization_from_dict,
+        run=lambda realization: engine_result(realization_digest=realization.digest, products=products),
+    )
+    figures = SimpleNamespace(run_figure=lambda _: Figure())
+    modules = {"engine": engine, "engine.figures": figures, "numpy": np}
+    monkeypatch.setattr("service.worker.import_module", modules.__getitem__)
+    payload = read_payload(execute(SPEC, str(tmp_path)))
+    assert payload.realization_digest == digest
+    store = ArtefactStore(str(tmp_path))
+    assert payload.figure is not None
+    assert payload.products is not None
+    assert store.read(payload.figure.key).startswith(b"\x89PNG")
+    with np.load(store.path(payload.products.key), allow_pickle=False) as arrays:
+        assert set(arrays) == {"image", "model", "names"}
+        assert arrays["image"].shape == (4, 5)

@@ -33,7 +33,7 @@ from service.store.tables import attempt, grid, result, run
 from tests.service.conftest import Clock, empty
 from tests.service.plans import result_of, submit
 
-EXAMPLES = int(os.environ.get("HOSTLENS_MODEL_EXAMPLES", "25"))
+EXAMPLES = int(os.environ.get("HOSTLENS_MODEL_EXAMPLES", "15"))
 
 
 class Queue(RuleBasedStateMachine):
