@@ -16,7 +16,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class Heartbeat:
-    """Beats for one generation until it is stopped; ``lost`` is set once another leads or may lead."""
+    """Beats for one generation until it is stopped; ``lost`` is set once another leads."""
 
     def __init__(self, settings: Settings, generation: int) -> None:
         self.lost = threading.Event()
@@ -38,7 +38,6 @@ class Heartbeat:
     def _beat(self) -> None:
         database = Database(self._settings.database, pooled=False)
         leadership = Leadership(database, self._settings.leader_ttl_s)
-        beaten = time.monotonic()
         told = -1
         while not self._stop.is_set():
             try:
@@ -47,12 +46,10 @@ class Heartbeat:
                     _LOG.error("another dispatcher leads")
                     self.lost.set()
                     return
-                beaten = time.monotonic()
             except DBAPIError as error:
+                # However long it takes: nobody can take over without the database either, and once it is back this
+                # beat tells whether someone has. To give up would drop the results that wait to be stored.
                 _LOG.warning("no heartbeat: %s", error.orig)
-                if time.monotonic() - beaten > self._settings.leader_ttl_s:
-                    self.lost.set()
-                    return
             self._wait(told)
         database.close()
 

@@ -45,7 +45,10 @@ def dispatch(settings: Settings) -> int:
         generation = wait_to_lead(leadership, settings, stop)
         if generation is None:
             return STOPPED
-        _lead(settings, database, generation, stop)
+        try:
+            _lead(settings, database, generation, stop)
+        except OSError as error:
+            _LOG.error("no workers: %s", error)
         with suppress(DBAPIError):  # without it the row runs out by itself
             leadership.resign(generation)
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.loop import Dispatcher
 from service.payload import ResultPayload
 from service.settings import Settings
@@ -178,3 +180,28 @@ def test_a_lost_heartbeat_ends_the_loop(database: Database, tmp_path: Path) -> N
     setting.heartbeat.lost.set()
     setting.run()
     assert setting.pool.submitted == []
+
+
+def test_a_heartbeat_outlasts_the_database_and_ends_once_another_leads(database: Database, tmp_path: Path) -> None:
+    leadership = Leadership(database)
+    generation = leadership.take("test")
+    assert generation == 1
+    file = Path(str(database.url.database))
+    settings = Settings(database_url=f"sqlite:///{file}", heartbeat_s=0.05, leader_ttl_s=0.1)
+    heartbeat = Heartbeat(settings, generation)
+    hidden = file.with_name("hidden")
+    database.close()
+    file.rename(hidden)
+    file.mkdir()  # SQLite cannot open it, and would make a new file where there is none
+    heartbeat.start()
+    assert not heartbeat.lost.wait(0.5)
+    file.rmdir()
+    hidden.rename(file)
+    heartbeat.workers = 2
+    until = time.monotonic() + 10
+    while (view := leadership.view()) is None or view.workers != 2:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert leadership.take("next", lambda _: True) == 2
+    assert heartbeat.lost.wait(10)
+    heartbeat.stop()
