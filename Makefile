@@ -1,0 +1,56 @@
+# Everything from a fresh clone with Python 3.11, make and nothing else prepared.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+# The constraints hold for build dependencies too, hence also as a variable.
+INSTALL := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet -c constraints.txt
+
+.PHONY: help demo serve test lint clean install install-test
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo    four runs of HE0435-1223 through the whole system, with a table of biases"
+	@echo "make serve   run the service until Ctrl-C"
+	@echo "make test    ruff, mypy and all tests"
+	@echo "make lint    ruff and mypy"
+	@echo "make clean   remove the virtual environment and caches (not var/, where data lies)"
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "hostlens needs Python 3.11 or newer: make PYTHON=python3.11 ..."; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || \
+	  { echo "$(PYTHON) cannot make virtual environments: install python3-venv (as root: apt-get install python3-venv)"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing hostlens into $(VENV) (a minute or two)"
+	$(INSTALL) -e .
+	@touch $@
+
+$(VENV)/installed-test: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing hostlens and what its tests need into $(VENV) (a minute or two)"
+	$(INSTALL) -e '.[test]'
+	@touch $@ $(VENV)/installed
+
+install: $(VENV)/installed
+
+install-test: $(VENV)/installed-test
+
+demo: install
+	$(BIN)/hostlens demo
+
+# exec: Ctrl-C and signals go to the service, not to a shell in between.
+serve: install
+	@exec $(BIN)/hostlens serve
+
+lint: install-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,71 @@
+"""The FastAPI application."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+from fastapi import Depends, FastAPI
+
+from service import VERSION
+from service.api import catalogue, grids, health, problems
+from service.api.context import Context
+from service.api.limits import BodyLimit, known_parameters
+from service.schemas import Problem
+from service.settings import Settings
+
+_PROBLEM: dict[str, Any] = {
+    "description": "A problem (RFC 9457)",
+    "content": {problems.MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+}
+
+
+class _App(FastAPI):
+    """FastAPI with every error documented as the problem that it is."""
+
+    def openapi(self) -> dict[str, Any]:
+        """Make the document once; FastAPI's own describes 422 in a form that this API does not send."""
+        if self.openapi_schema is None:
+            document = super().openapi()
+            schemas = document.setdefault("components", {}).setdefault("schemas", {})
+            schemas["Problem"] = Problem.model_json_schema(
+                mode="serialization", ref_template="#/components/schemas/{model}"
+            )
+            schemas |= schemas["Problem"].pop("$defs", {})
+            schemas.pop("HTTPValidationError", None)
+            schemas.pop("ValidationError", None)
+            for operations in document["paths"].values():
+                for operation in operations.values():
+                    operation["responses"].pop("422", None)
+                    operation["responses"] |= {"4XX": _PROBLEM, "5XX": _PROBLEM}
+            self.openapi_schema = document
+        return self.openapi_schema
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """Build the application; the database must have been migrated, and need not be there yet."""
+    context = Context(settings or Settings())
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        # Nothing but connections lives with the application: the dispatcher is a process of its own.
+        yield
+        context.database.close()
+
+    app = _App(
+        title="hostlens",
+        version=VERSION,
+        summary="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+        dependencies=[Depends(known_parameters)],
+        redirect_slashes=False,
+    )
+    app.state.context = context
+    app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes)
+    problems.install(app)
+    for room in (grids, catalogue, health):
+        app.include_router(room.router)
+    return app

@@ -1,0 +1,42 @@
+"""/v1/systems, /v1/cameras, /v1/engine."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Path
+
+from engine.errors import SpecError
+from service import VERSION
+from service.requests import engine_view, list_cameras, list_systems, system_view
+from service.schemas import CameraList, EngineView, SystemList, SystemView
+from service.store.grids import NotFoundError
+
+router = APIRouter(prefix="/v1", tags=["catalogue"])
+
+
+@router.get("/systems")
+def systems() -> SystemList:
+    """The lens systems that a grid may name."""
+    return SystemList(items=list_systems())
+
+
+@router.get("/systems/{name}")
+def system(name: Annotated[str, Path(max_length=64)]) -> SystemView:
+    """One lens system with source and confidence of every number."""
+    try:
+        return system_view(name)
+    except SpecError as error:
+        raise NotFoundError(str(error)) from error
+
+
+@router.get("/cameras")
+def cameras() -> CameraList:
+    """The cameras of the catalogue."""
+    return CameraList(items=list_cameras())
+
+
+@router.get("/engine")
+def engine() -> EngineView:
+    """Which engine this process carries, and the presets that it knows."""
+    return engine_view(VERSION)

@@ -1,0 +1,38 @@
+"""What a handler needs of the process that serves it, and the shapes of the parameters that several share."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Depends, Path, Query, Request
+
+from service.artefacts import ArtefactStore
+from service.identifiers import GRID_PATTERN, RUN_PATTERN
+from service.settings import Settings
+from service.store.database import Database
+from service.store.grids import GridStore
+from service.store.leadership import Leadership
+
+
+class Context:
+    """Settings and stores of one API process."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.database = Database(settings.database)
+        self.grids = GridStore(self.database)
+        self.leadership = Leadership(self.database, settings.leader_ttl_s)
+        self.artefacts = ArtefactStore(settings.artefacts)
+
+
+def _context(request: Request) -> Context:
+    context = request.app.state.context
+    if not isinstance(context, Context):
+        raise TypeError(type(context))
+    return context
+
+
+Service = Annotated[Context, Depends(_context)]
+GridId = Annotated[str, Path(pattern=GRID_PATTERN, description="A grid's identifier")]
+RunId = Annotated[str, Path(pattern=RUN_PATTERN, description="A run's identifier")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="Items on a page")]

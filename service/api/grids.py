@@ -1,0 +1,118 @@
+"""/v1/grids and /v1/runs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi.responses import JSONResponse
+
+from service.api.context import GridId, Limit, RunId, Service
+from service.api.pages import next_link
+from service.identifiers import GRID_PATTERN
+from service.requests import GridRequest, plan
+from service.schemas import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
+from service.store.grids import NotFoundError
+from service.store.states import RunState
+from service.store.summary import summarise
+
+router = APIRouter(prefix="/v1", tags=["grids"])
+IdempotencyKey = Annotated[
+    str | None,
+    Header(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description="Same key, same grid"),
+]
+Ordinal = Annotated[int, Query(ge=0, le=10_000_000, description="From Link or next")]
+_PNG = {200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}}
+_SHOWN_LABELS = 100
+
+
+@router.post(
+    "/grids",
+    status_code=202,
+    response_model=GridView,
+    responses={200: {"model": DryRun, "description": "What a dry run would start"}},
+)
+def submit(
+    body: GridRequest, service: Service, dry_run: bool = False, idempotency_key: IdempotencyKey = None
+) -> JSONResponse:
+    """Accept a grid: once this answers 202 its runs are in the database. ``dry_run`` only checks."""
+    if dry_run:
+        labels = [run.label for run in plan(body, service.settings.max_grid_runs)]
+        return JSONResponse(DryRun(n_runs=len(labels), labels=labels[:_SHOWN_LABELS]).model_dump(mode="json"))
+    made = service.grids.create(
+        body.canonical(), lambda: plan(body, service.settings.max_grid_runs), body.name, idempotency_key
+    )
+    headers = {"Location": made.grid.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
+    return JSONResponse(made.grid.model_dump(mode="json"), status_code=202, headers=headers)
+
+
+@router.get("/grids")
+def list_grids(
+    request: Request,
+    response: Response,
+    service: Service,
+    limit: Limit = 100,
+    cursor: Annotated[str | None, Query(pattern=GRID_PATTERN, description="From Link or next")] = None,
+) -> GridPage:
+    """Grids, newest first."""
+    page = service.grids.grids(limit, cursor)
+    return page.model_copy(update={"next": next_link(request, response, page.next)})
+
+
+@router.get("/grids/{grid_id}")
+def show_grid(grid_id: GridId, service: Service) -> GridView:
+    """One grid: its runs by state, rate and time left."""
+    return service.grids.grid(grid_id)
+
+
+@router.get("/grids/{grid_id}/runs")
+def list_runs(
+    request: Request,
+    response: Response,
+    grid_id: GridId,
+    service: Service,
+    limit: Limit = 100,
+    cursor: Ordinal | None = None,
+    state: RunState | None = None,
+) -> RunPage:
+    """A grid's runs in its order."""
+    page = service.grids.runs(grid_id, limit, -1 if cursor is None else cursor, state)
+    return page.model_copy(update={"next": next_link(request, response, page.next)})
+
+
+@router.get("/grids/{grid_id}/summary")
+def summary(
+    request: Request,
+    response: Response,
+    grid_id: GridId,
+    service: Service,
+    limit: Limit = 1000,
+    cursor: Ordinal = 0,
+) -> Summary:
+    """Recovered values and biases by input, and over the whole grid."""
+    found = summarise(service.database, service.grids.grid(grid_id), limit, cursor)
+    return found.model_copy(update={"next": next_link(request, response, found.next)})
+
+
+@router.post("/grids/{grid_id}/cancel")
+def cancel(grid_id: GridId, service: Service) -> GridView:
+    """Cancel a grid: queued runs at once, running ones as soon as the dispatcher sees it."""
+    return service.grids.cancel(grid_id)
+
+
+@router.get("/runs/{run_id}")
+def show_run(run_id: RunId, service: Service) -> RunDetail:
+    """One run: specification, state, result, attempts."""
+    return service.grids.run(run_id)
+
+
+@router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]
+def figure(run_id: RunId, service: Service) -> Response:
+    """Observation, model, normalised residual, source against truth, as PNG."""
+    found = service.grids.run(run_id).result
+    if found is None or found.figure is None:
+        raise NotFoundError(f"run {run_id} has no figure")
+    try:
+        return Response(service.artefacts.read(found.figure), media_type="image/png")
+    except FileNotFoundError as error:
+        raise NotFoundError(f"the figure of run {run_id} is no longer in the artefact store") from error

@@ -1,0 +1,147 @@
+"""Every error as RFC 9457 problem+json, with the list of places; never a traceback."""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+from typing import Any, Literal
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import ValidationError
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
+from starlette.exceptions import HTTPException
+
+from engine.errors import SpecError
+from engine.spec import spec_error
+from service.requests import TooManyRunsError
+from service.schemas import Place, Problem
+from service.store.grids import KeyReusedError, NotFoundError
+
+MEDIA_TYPE = "application/problem+json"
+_LOG = logging.getLogger(__name__)
+_SOURCES: dict[str, Literal["body", "query", "path", "header"]] = {
+    "body": "body",
+    "query": "query",
+    "path": "path",
+    "header": "header",
+}
+
+
+class InvalidRequestError(ValueError):
+    """A request is not acceptable at one place."""
+
+    def __init__(self, source: Literal["body", "query", "path", "header"], pointer: str, message: str) -> None:
+        super().__init__(message)
+        self.place = Place.model_validate({"in": source, "pointer": pointer, "message": message})
+
+
+def problem(
+    request: Request | None,
+    status: int,
+    detail: str | None = None,
+    errors: list[Place] | None = None,
+    headers: dict[str, str] | None = None,
+) -> JSONResponse:
+    """The answer to a request that failed."""
+    body = Problem(
+        title=HTTPStatus(status).phrase,
+        status=status,
+        detail=detail and _printable(detail),
+        instance=None if request is None else _printable(request.url.path),
+        errors=errors or [],
+    )
+    document = body.model_dump(mode="json", by_alias=True, exclude_none=True)
+    return JSONResponse(document, status_code=status, headers=headers, media_type=MEDIA_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Answer every exception of an app with a problem."""
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(InvalidRequestError, _invalid_place)
+    app.add_exception_handler(SpecError, _bad_spec)
+    app.add_exception_handler(ValidationError, _bad_model)
+    app.add_exception_handler(TooManyRunsError, _too_many)
+    app.add_exception_handler(NotFoundError, _not_found)
+    app.add_exception_handler(KeyReusedError, _key_reused)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(DBAPIError, _database)
+    app.add_exception_handler(PoolTimeoutError, _database)
+    app.add_exception_handler(SQLAlchemyError, _unexpected)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _printable(text: str) -> str:
+    """Text that UTF-8 can carry: a client may send lone surrogates, and be told of them."""
+    return text.encode("utf-8", "replace").decode("utf-8")[:2000]
+
+
+def _pointer(parts: tuple[Any, ...]) -> str:
+    steps = (str(part).replace("~", "~0").replace("/", "~1") for part in parts)
+    return _printable("".join(f"/{step}" for step in steps))
+
+
+def _place(error: dict[str, Any]) -> Place:
+    source, *rest = error["loc"] or ("body",)
+    where = _SOURCES.get(str(source), "body")
+    pointer = _pointer(tuple(rest)) if where == "body" else _printable(".".join(map(str, rest)))
+    return Place.model_validate({"in": where, "pointer": pointer, "message": _printable(error["msg"])})
+
+
+def _invalid(request: Request, error: Exception) -> JSONResponse:
+    places = [_place(found) for found in getattr(error, "errors", list)()]
+    return problem(request, 422, "the request is not acceptable; see errors", places[:100])
+
+
+def _invalid_place(request: Request, error: Exception) -> JSONResponse:
+    place: Place | None = getattr(error, "place", None)
+    return problem(request, 422, str(error), [place] if place else [])
+
+
+def _bad_spec(request: Request, error: Exception) -> JSONResponse:
+    field = str(getattr(error, "field", ""))
+    pointer = "/" + field.replace(".", "/")
+    place = Place.model_validate({"in": "body", "pointer": _printable(pointer), "message": _printable(str(error))})
+    return problem(request, 422, str(error), [place])
+
+
+def _bad_model(request: Request, error: Exception) -> JSONResponse:
+    if not isinstance(error, ValidationError):  # pragma: no cover - registered for this type alone
+        raise error
+    return _bad_spec(request, spec_error(error))
+
+
+def _too_many(request: Request, error: Exception) -> JSONResponse:
+    place = Place.model_validate({"in": "body", "pointer": "/replicates", "message": str(error)})
+    return problem(request, 422, str(error), [place])
+
+
+def _not_found(request: Request, error: Exception) -> JSONResponse:
+    return problem(request, 404, str(error))
+
+
+def _key_reused(request: Request, _: Exception) -> JSONResponse:
+    message = "this Idempotency-Key was used for another request"
+    place = Place.model_validate({"in": "header", "pointer": "idempotency-key", "message": message})
+    return problem(request, 422, message, [place])
+
+
+def _http(request: Request, error: Exception) -> JSONResponse:
+    if not isinstance(error, HTTPException):  # pragma: no cover - registered for this type alone
+        raise error
+    return problem(request, error.status_code, error.detail, headers=dict(error.headers or {}))
+
+
+def _database(request: Request, error: Exception) -> JSONResponse:
+    # Programming errors and broken constraints are ours; everything else means that the database cannot serve now.
+    if isinstance(error, DBAPIError) and type(error).__name__ not in {"OperationalError", "InterfaceError"}:
+        return _unexpected(request, error)
+    _LOG.error("the database is not available: %s", error)
+    return problem(request, 503, "the database is not available", headers={"Retry-After": "5"})
+
+
+def _unexpected(request: Request, error: Exception) -> JSONResponse:
+    _LOG.error("unexpected error at %s", request.url.path, exc_info=error)
+    return problem(request, 500, "an unexpected error, which has been logged")

@@ -1,0 +1,222 @@
+"""The command ``hostlens``."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import httpx
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+
+from service import VERSION
+from service.client import ApiError, Client
+from service.settings import Settings
+from service.tables import grid_line, runs_table, summary_table
+from service.watch import progress
+
+app = typer.Typer(
+    name="hostlens",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
+)
+database = typer.Typer(no_args_is_help=True, help="The database.")
+app.add_typer(database, name="db")
+
+Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]
+Floats = Annotated[list[float] | None, typer.Option()]
+
+
+def _console() -> Console:
+    return Console()
+
+
+def _fail(message: str) -> NoReturn:
+    Console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit(1)
+
+
+def _settings(**changes: Any) -> Settings:
+    try:
+        return Settings(**{name: value for name, value in changes.items() if value is not None})
+    except ValidationError as error:
+        _fail("\n".join(f"setting {'.'.join(map(str, e['loc'])) or 'HOSTLENS_*'}: {e['msg']}" for e in error.errors()))
+
+
+def _client(url: str | None) -> Client:
+    if url is None:
+        settings = _settings()
+        url = f"http://{settings.host}:{settings.port}"
+    return Client(url)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(VERSION)
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False,
+) -> None:
+    """Simulate lensed quasars, reconstruct their hosts, and keep the biases."""
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Where the API listens")] = None,
+    port: Annotated[int | None, typer.Option(help="Port of the API")] = None,
+    workers: Annotated[int | None, typer.Option(help="Worker processes")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of database and artefacts")] = None,
+) -> None:
+    """Run the service (API, dispatcher, workers) until Ctrl-C."""
+    from service.supervisor import serve as supervise  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    settings = _settings(host=host, port=port, workers=workers, data_dir=data_dir)
+    address = f"http://{settings.host}:{settings.port}"
+    try:
+        supervise(settings, lambda: _console().print(f"hostlens serves {address}; Ctrl-C ends it", highlight=False))
+    except OSError as error:
+        _fail(f"cannot serve {address}: {error}")
+
+
+@app.command()
+def api() -> None:
+    """Run one API process alone."""
+    from service.api.serve import serve as serve_api  # noqa: PLC0415 - loads the engine
+
+    serve_api(_settings())
+
+
+@app.command()
+def dispatcher() -> None:
+    """Run one dispatcher process alone; a second one stands by."""
+    from service.dispatcher.process import dispatch  # noqa: PLC0415 - loads Dask
+
+    raise typer.Exit(dispatch(_settings()))
+
+
+@app.command()
+def demo(
+    data_dir: Annotated[Path, typer.Option(help="Folder of the demo's database and figures")] = Path("var/demo"),
+) -> None:
+    """Four runs of HE0435-1223 through the whole system; exit code 0 only if all four were stored."""
+    from service.demo import demo as run_demo  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    raise typer.Exit(run_demo(_settings(data_dir=data_dir), _console()))
+
+
+@app.command()
+def submit(
+    preset: Annotated[str | None, typer.Option(help="As h0licow-vi/HE0435")] = None,
+    system: Annotated[list[str] | None, typer.Option(help="May be repeated, like the values below")] = None,
+    n: Floats = None,
+    r_eff: Floats = None,
+    magnitude: Floats = None,
+    l_eta: Floats = None,
+    seed: Annotated[int | None, typer.Option()] = None,
+    replicates: Annotated[int | None, typer.Option()] = None,
+    name: Annotated[str | None, typer.Option(help="For people")] = None,
+    file: Annotated[Path | None, typer.Option(help="A JSON body; options override it", exists=True)] = None,
+    key: Annotated[str | None, typer.Option(help="Idempotency key")] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
+    url: Url = None,
+) -> None:
+    """Submit a grid."""
+    request = {} if file is None else json.loads(file.read_text(encoding="utf-8"))
+    options = {
+        "preset": preset, "systems": system, "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta,
+        "seed": seed, "replicates": replicates, "name": name,
+    }  # fmt: skip
+    request |= {option: value for option, value in options.items() if value not in (None, [])}
+    with _Talk(url) as client:
+        grid = client.submit(request, key)
+        typer.echo(grid.id)
+        if watch:
+            _watch(client, grid.id)
+
+
+@app.command()
+def status(
+    grid: Annotated[str | None, typer.Argument(help="A grid; the newest ones without")] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
+    runs: Annotated[bool, typer.Option("--runs", help="List the runs")] = False,
+    url: Url = None,
+) -> None:
+    """How far grids are."""
+    with _Talk(url) as client:
+        if grid is None:
+            for item in client.grids().items:
+                typer.echo(grid_line(item))
+        elif watch:
+            _watch(client, grid)
+        elif runs:
+            _console().print(runs_table(client.runs(grid)))
+        else:
+            typer.echo(grid_line(client.status(grid)))
+
+
+@app.command()
+def results(
+    grid: Annotated[str, typer.Argument()],
+    as_json: Annotated[bool, typer.Option("--json", help="The summary as the API gives it")] = False,
+    url: Url = None,
+) -> None:
+    """Recovered values and biases of a grid."""
+    with _Talk(url) as client:
+        summary = client.summary(grid)
+        if as_json:
+            typer.echo(summary.model_dump_json(indent=2))
+        else:
+            _console().print(summary_table(summary))
+
+
+@app.command()
+def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Cancel a grid."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.cancel(grid)))
+
+
+@database.command("upgrade")
+def db_upgrade() -> None:
+    """Bring the database to the newest schema."""
+    from service.store.migrate import upgrade  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    settings = _settings()
+    settings.make_folders()
+    upgrade(settings.database)
+    typer.echo("the database is up to date")
+
+
+def _watch(client: Client, grid_id: str) -> None:
+    with progress(_console()) as show:
+        grid = client.wait(grid_id, show)
+    typer.echo(grid_line(grid))
+    if grid.counts.done != grid.n_runs:
+        raise typer.Exit(1)
+
+
+class _Talk:
+    """A client whose refusals end the command with a line instead of a traceback."""
+
+    def __init__(self, url: str | None) -> None:
+        self._client = _client(url)
+
+    def __enter__(self) -> Client:
+        return self._client.__enter__()
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        self._client.__exit__()
+        if isinstance(error, ApiError):
+            _fail(str(error))
+        if isinstance(error, httpx.TransportError):
+            _fail(f"the service does not answer: {error}")

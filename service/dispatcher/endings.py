@@ -1,0 +1,62 @@
+"""How a run that came back from Dask ends: what is stored, what is tried again, what is given up."""
+
+from __future__ import annotations
+
+import traceback
+from typing import Any
+
+from distributed import KilledWorker
+
+from service.payload import InvalidResultError, ResultPayload, read_payload
+from service.store.leases import Lease, Outcome
+from service.store.queue import Failure
+
+ERROR_RETRIES = 2
+WORKER_LOST_RETRIES = 2
+DEADLINE_RETRIES = 1
+
+
+def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure:
+    """What a worker's answer means for the run."""
+    if not isinstance(answer, dict) or not {"payload", "error"} & set(answer):
+        return _invalid("the worker's answer has neither a payload nor an error")
+    if "error" in answer:
+        error = answer["error"]
+        retries = 0 if error["permanent"] else ERROR_RETRIES
+        return Failure(Outcome.ERROR, str(error["code"])[:64], clean(error["message"]), retries)
+    try:
+        payload = read_payload(answer["payload"])
+    except InvalidResultError as error:
+        return _invalid(str(error))
+    if payload.realization_digest != lease.digest:
+        return _invalid(f"the result is that of another realization: {payload.realization_digest}")
+    return payload
+
+
+def read_exception(error: BaseException) -> Failure:
+    """What Dask's own failure to run a run means for it."""
+    if isinstance(error, KilledWorker):
+        text = "the worker died while it ran this"
+        return Failure(Outcome.WORKER_LOST, "worker_lost", text, WORKER_LOST_RETRIES, suspect=True)
+    # Not str(error): that calls code of whatever library raised it, which may raise itself.
+    text = clean("".join(traceback.format_exception_only(error)).strip())
+    return Failure(Outcome.ERROR, "task_error", text, ERROR_RETRIES)
+
+
+def overdue(deadline_s: float) -> Failure:
+    """A run that took longer than it may."""
+    return Failure(Outcome.DEADLINE, "deadline", f"not done within {deadline_s:g} s", DEADLINE_RETRIES)
+
+
+def unstorable(error: BaseException) -> Failure:
+    """A payload that the database refuses."""
+    return _invalid(f"the database refused the result: {type(error).__name__}")
+
+
+def clean(text: object) -> str:
+    """Text that every database takes: messages of foreign libraries can hold anything."""
+    return str(text).encode("utf-8", "replace").decode("utf-8").replace("\x00", "\ufffd")[:2000]
+
+
+def _invalid(detail: str) -> Failure:
+    return Failure(Outcome.ERROR, "invalid_result", clean(detail), retries=0)

@@ -1,0 +1,60 @@
+"""The leader's heartbeat: a thread with a connection of its own, so that slow work does not look like death."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+from sqlalchemy.exc import DBAPIError
+
+from service.settings import Settings
+from service.store.database import Database
+from service.store.leadership import Leadership
+
+_LOG = logging.getLogger(__name__)
+
+
+class Heartbeat:
+    """Beats for one generation until it is stopped; ``lost`` is set once another leads."""
+
+    def __init__(self, settings: Settings, generation: int) -> None:
+        self.lost = threading.Event()
+        self.workers = 0
+        self._settings = settings
+        self._generation = generation
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def start(self) -> None:
+        """Begin to beat."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and wait for a beat that is under way."""
+        self._stop.set()
+        self._thread.join(timeout=self._settings.leader_ttl_s)
+
+    def _beat(self) -> None:
+        database = Database(self._settings.database, pooled=False)
+        leadership = Leadership(database, self._settings.leader_ttl_s)
+        told = -1
+        while not self._stop.is_set():
+            try:
+                told = self.workers
+                if not leadership.beat(self._generation, told):
+                    _LOG.error("another dispatcher leads")
+                    self.lost.set()
+                    return
+            except DBAPIError as error:
+                # However long it takes: nobody can take over without the database either, and once it is back this
+                # beat tells whether someone has. To give up would drop the results that wait to be stored.
+                _LOG.warning("no heartbeat: %s", error.orig)
+            self._wait(told)
+        database.close()
+
+    def _wait(self, told: int) -> None:
+        """Sleep for a beat, or less where the number of workers changes: readiness should not lag behind it."""
+        until = time.monotonic() + self._settings.heartbeat_s
+        while time.monotonic() < until and self.workers == told and not self._stop.wait(0.2):
+            pass

@@ -1,0 +1,198 @@
+"""What a worker sends back for one run: finite numbers and the addresses of its artefacts, nothing else.
+
+The payload is the contract between worker and dispatcher. It is validated where it is made *and* where it is stored,
+because a remote worker can be of another version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+if TYPE_CHECKING:
+    from engine.result import Estimate, Quantity, RunResult
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Text = Annotated[str, Field(max_length=2000)]
+EstimateName = Literal["paper_free", "paper_fixed", "projected_free", "projected_fixed"]
+ESTIMATES: tuple[EstimateName, ...] = get_args(EstimateName)
+QUANTITIES = ("magnitude", "r_eff", "n", "q", "position_angle")
+LENS_PARAMETERS = ("theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda")
+
+
+class InvalidResultError(ValueError):
+    """A run ended with a result that must not be stored: a number is not finite, or a part is missing."""
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class QuantityPayload(_Strict):
+    """Mean and standard deviation of a recovered quantity, and the truth where there is one."""
+
+    mean: Finite
+    sd: NonNegative
+    truth: Finite | None = None
+
+    @property
+    def bias(self) -> float | None:
+        """Recovered minus true, None without a truth."""
+        return None if self.truth is None else self.mean - self.truth
+
+
+class EstimatePayload(_Strict):
+    """What one estimator recovered: magnitude [AB], r_eff [arcsec], n, q, position angle [deg]."""
+
+    magnitude: QuantityPayload
+    r_eff: QuantityPayload
+    n: QuantityPayload
+    q: QuantityPayload
+    position_angle: QuantityPayload
+    draws: Annotated[int, Field(ge=1)]
+    at_bound: Annotated[int, Field(ge=0)]
+    failed: Annotated[int, Field(ge=0)]
+
+
+class ChainPayload(_Strict):
+    """How well the posterior was sampled."""
+
+    status: Literal["converged", "not_converged"]
+    walkers: Annotated[int, Field(ge=1)]
+    steps: Annotated[int, Field(ge=0)]
+    burn_in: Annotated[int, Field(ge=0)]
+    tau: NonNegative
+    effective_samples: NonNegative
+    acceptance: NonNegative
+    evaluations: Annotated[int, Field(ge=0)]
+
+
+class StagePayload(_Strict):
+    """Wall and CPU seconds of one stage."""
+
+    stage: Annotated[str, Field(max_length=64)]
+    wall_s: NonNegative
+    cpu_s: NonNegative
+
+
+class ArtefactPayload(_Strict):
+    """Where an artefact lies: its key in the store and the SHA-256 of its bytes."""
+
+    key: Annotated[str, Field(max_length=200)]
+    digest: Digest
+
+
+class ResultPayload(_Strict):
+    """Everything that is stored of one run."""
+
+    realization_digest: Digest
+    engine_digest: Digest
+    versions: dict[str, Text]
+    noise_treatment: Annotated[str, Field(max_length=32)]
+    estimates: dict[EstimateName, EstimatePayload]
+    lens: dict[str, QuantityPayload]
+    chain: ChainPayload
+    ln_evidence: Finite
+    chi2: NonNegative
+    degrees_of_freedom: int
+    condition_number: NonNegative
+    arc_magnitude: Finite
+    agn_contrast: Finite | None
+    surface_brightness: Finite
+    stages: tuple[StagePayload, ...]
+    warnings: tuple[Text, ...] = ()
+    figure: ArtefactPayload | None = None
+    products: ArtefactPayload | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> ResultPayload:
+        missing = [name for name in ESTIMATES if name not in self.estimates]
+        if missing:
+            raise ValueError(f"estimates are missing: {', '.join(missing)}")
+        unknown = sorted(set(self.lens) - set(LENS_PARAMETERS))
+        if unknown:
+            raise ValueError(f"unknown lens parameters: {', '.join(unknown)}")
+        return self
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what the run found.
+
+        Times and pictures are left out: two executions of one run must agree in this and may differ in those.
+        """
+        document = self.model_dump(mode="json", exclude={"stages", "figure", "products", "versions"})
+        return hashlib.sha256(json.dumps(document, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+    @property
+    def wall_s(self) -> float:
+        """Wall seconds of all stages."""
+        return sum(stage.wall_s for stage in self.stages)
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU seconds of all stages."""
+        return sum(stage.cpu_s for stage in self.stages)
+
+
+def result_payload(
+    result: RunResult, figure: ArtefactPayload | None = None, products: ArtefactPayload | None = None
+) -> ResultPayload:
+    """The payload of an engine's result.
+
+    Raises
+    ------
+    InvalidResultError
+        A number is not finite or a part is missing; the message names the first.
+    """
+    return read_payload(
+        {
+            "realization_digest": result.realization_digest,
+            "engine_digest": result.engine_digest,
+            "versions": dict(result.versions),
+            "noise_treatment": result.noise_treatment,
+            "estimates": {f"{e.estimator}_{e.index_prior}": _estimate(e) for e in result.estimates},
+            "lens": {parameter.name: _quantity(parameter.value) for parameter in result.lens},
+            "chain": {name: _plain(getattr(result.chain, name)) for name in ChainPayload.model_fields},
+            "ln_evidence": float(result.ln_evidence),
+            "chi2": float(result.chi2),
+            "degrees_of_freedom": int(result.degrees_of_freedom),
+            "condition_number": float(result.condition_number),
+            "arc_magnitude": float(result.arc_magnitude),
+            "agn_contrast": None if result.agn_contrast is None else float(result.agn_contrast),
+            "surface_brightness": float(result.surface_brightness),
+            "stages": [{"stage": s.stage, "wall_s": float(s.wall_s), "cpu_s": float(s.cpu_s)} for s in result.stages],
+            "warnings": [warning[:2000] for warning in result.warnings],
+            "figure": figure,
+            "products": products,
+        }
+    )
+
+
+def read_payload(document: object) -> ResultPayload:
+    """Validate a payload, wherever it comes from; an InvalidResultError names the first part that is wrong."""
+    try:
+        return ResultPayload.model_validate(document)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "payload"
+        raise InvalidResultError(f"{place}: {first['msg']}") from error
+
+
+def _estimate(estimate: Estimate) -> dict[str, Any]:
+    quantities = {name: _quantity(getattr(estimate, name)) for name in QUANTITIES}
+    return {**quantities, "draws": estimate.draws, "at_bound": estimate.at_bound, "failed": estimate.failed}
+
+
+def _quantity(quantity: Quantity) -> dict[str, Any]:
+    truth = None if quantity.truth is None else float(quantity.truth)
+    return {"mean": float(quantity.mean), "sd": float(quantity.sd), "truth": truth}
+
+
+def _plain(value: Any) -> Any:
+    """A numpy scalar as Python's own, so that the payload is JSON."""
+    return value.item() if hasattr(value, "item") else value

@@ -1,0 +1,183 @@
+"""What may be asked for: the body of POST /v1/grids, and the runs that it means.
+
+The one module of the API that knows the engine's specifications.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, create_model
+
+from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
+from engine.grid import Grid, expand, preset_names
+from engine.spec import Analysis, NoiseLevel
+from service.schemas import CameraItem, EngineView, SystemItem, SystemView
+from service.store.grids import PlannedRun
+
+if TYPE_CHECKING:
+    from engine.grid import GridRun
+
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+_PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
+_MAX_VALUES = 1000
+
+# Strict, or true would be the number 1 and "20.5" a number.
+Number = Annotated[float, Strict()]
+Identifier = Annotated[str, StringConstraints(max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$")]
+
+
+def _optional_fields() -> dict[str, Any]:
+    """The engine's Analysis with every field optional, so that a request names only what differs."""
+    hints = get_type_hints(Analysis, include_extras=True)
+    return {field.name: (hints[field.name] | None, None) for field in dataclasses.fields(Analysis)}
+
+
+AnalysisRequest = create_model("AnalysisRequest", __config__=_CONFIG, **_optional_fields())
+AnalysisRequest.__doc__ = "What to change of the default analysis."
+
+if TYPE_CHECKING:
+    AnalysisBody = BaseModel
+else:
+    AnalysisBody = AnalysisRequest
+
+
+_SOME = Field(min_length=1, max_length=_MAX_VALUES)
+Indices = Annotated[list[Annotated[Number, Field(ge=0.3, le=10.0)]], _SOME]
+Radii = Annotated[list[Annotated[Number, Field(ge=1e-4, le=60.0)]], _SOME]
+Magnitudes = Annotated[list[Annotated[Number, Field(ge=5.0, le=40.0)]], _SOME]
+Slopes = Annotated[list[Annotated[Number, Field(ge=0.2, le=1.8)]], _SOME]
+
+
+class GridRequest(BaseModel):
+    """A grid of realizations.
+
+    With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
+    lists are needed, and every combination is run. ``replicates`` repeats each with seeds seed, seed + 1, ...
+    """
+
+    model_config = _CONFIG
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=_PRINTABLE)] | None = None
+    preset: Identifier | None = None
+    systems: Annotated[list[Identifier], _SOME] | None = None
+    n: Indices | None = None
+    r_eff: Radii | None = None
+    magnitude: Magnitudes | None = None
+    l_eta: Slopes | None = None
+    noise_level: NoiseLevel = "author"
+    mass_model: Identifier = "recommended"
+    seed: Annotated[int, Strict(), Field(ge=0, le=2**62)] = 0
+    replicates: Annotated[int, Strict(), Field(ge=1, le=100_000)] = 1
+    analysis: AnalysisBody | None = None
+
+    def canonical(self) -> dict[str, Any]:
+        """What was asked for, without what was left out: kept with the grid and compared under an idempotency key."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+class TooManyRunsError(ValueError):
+    """A grid has more runs than the service takes."""
+
+    def __init__(self, runs: int, allowed: int) -> None:
+        super().__init__(f"the grid has {runs} runs, allowed are {allowed}")
+
+
+def plan(request: GridRequest, max_runs: int) -> list[PlannedRun]:
+    """The runs that a request means, in the engine's order.
+
+    Raises
+    ------
+    engine.errors.SpecError
+        A value is not allowed.
+    TooManyRunsError
+        There would be more than ``max_runs``.
+    """
+    # Counted with one replicate and before anything is expanded: a few lists can mean more runs than there is memory.
+    lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
+    if request.preset is None:
+        _limit(math.prod(len(values or ()) for values in lists) * request.replicates, max_runs)
+    single = expand(_grid(request, replicates=1))
+    _limit(len(single) * request.replicates, max_runs)
+    runs = single if request.replicates == 1 else expand(_grid(request, request.replicates))
+    return [_planned(run) for run in runs]
+
+
+def _limit(runs: int, allowed: int) -> None:
+    if runs > allowed:
+        raise TooManyRunsError(runs, allowed)
+
+
+def _grid(request: GridRequest, replicates: int) -> Grid:
+    cuts = {
+        name: None if getattr(request, name) is None else tuple(getattr(request, name))
+        for name in ("systems", "n", "r_eff", "magnitude", "l_eta")
+    }
+    changes = {} if request.analysis is None else request.analysis.model_dump(exclude_none=True)
+    return Grid(
+        preset=request.preset,
+        mass_model=request.mass_model,
+        noise_level=request.noise_level,
+        seed=request.seed,
+        replicates=replicates,
+        analysis=Analysis(**changes),
+        **cuts,
+    )
+
+
+def _planned(run: GridRun) -> PlannedRun:
+    realization = run.realization
+    camera = realization.camera or _system_camera(realization.system_name)
+    inputs = {
+        "system": realization.system_name,
+        "camera": camera if isinstance(camera, str) else camera.name,
+        "mass_model": realization.mass_model,
+        "noise_level": realization.noise_level,
+        "noise_treatment": realization.analysis.noise_treatment,
+        "l_eta": realization.l_eta,
+        "n": realization.host.n,
+        "r_eff": realization.host.r_eff,
+        "magnitude": realization.host.magnitude,
+        "seed": realization.seed,
+    }
+    return PlannedRun(run.label, run.paper_run, realization.to_dict(), inputs, realization.digest)
+
+
+def _system_camera(name: str) -> str:
+    return load_system(name).camera
+
+
+def list_systems() -> list[SystemItem]:
+    """The catalogue's systems, in short."""
+    return [SystemItem(**_system_fields(name)) for name in system_names()]
+
+
+def system_view(name: str) -> SystemView:
+    """One system unabridged; a SpecError where the catalogue has none of that name."""
+    return SystemView(facts=system_facts(name), **_system_fields(name))
+
+
+def _system_fields(name: str) -> dict[str, Any]:
+    system = load_system(name)
+    return {
+        "name": name,
+        "camera": system.camera,
+        "mass_models": {model: sorted(map(float, slopes)) for model, slopes in system.mass_models.items()},
+        "links": {"self": f"/v1/systems/{name}"},
+    }
+
+
+def list_cameras() -> list[CameraItem]:
+    """The catalogue's cameras."""
+    fields = ("name", "pixel_scale", "drizzled_scale", "zero_point")
+    return [CameraItem(**{field: getattr(load_camera(name), field) for field in fields}) for name in camera_names()]
+
+
+def engine_view(version: str) -> EngineView:
+    """Which engine runs here."""
+    # Loaded when first asked for: the digest covers the numeric libraries, which take seconds to import.
+    digest: str = import_module("engine").engine_digest()
+    return EngineView(digest=digest, version=version, presets=list(preset_names()))

@@ -1,0 +1,332 @@
+"""What the API answers. Free of the engine, so that the client and the CLI start quickly."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.payload import ChainPayload, EstimateName, StagePayload
+from service.store.states import GridState, RunState
+
+UwsPhase = Literal["PENDING", "QUEUED", "EXECUTING", "COMPLETED", "ERROR", "ABORTED"]
+UWS_PHASES: dict[str, UwsPhase] = {
+    "queued": "QUEUED",
+    "leased": "EXECUTING",
+    "running": "EXECUTING",
+    "done": "COMPLETED",
+    "failed": "ERROR",
+    "quarantined": "ERROR",
+    "cancelled": "ABORTED",
+}
+"""States in the words of the IVOA's Universal Worker Service."""
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Place(_Answer):
+    """One thing that is wrong with a request, and where."""
+
+    source: Literal["body", "query", "path", "header"] = Field(serialization_alias="in", validation_alias="in")
+    pointer: str
+    """JSON pointer into the body, or the name of the parameter."""
+    message: str
+
+
+class Problem(_Answer):
+    """RFC 9457: every error of the API."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str | None = None
+    instance: str | None = None
+    errors: list[Place] = Field(default_factory=list)
+
+
+class RunCounts(_Answer):
+    """Runs of a grid by state."""
+
+    queued: int = 0
+    leased: int = 0
+    done: int = 0
+    failed: int = 0
+    quarantined: int = 0
+    cancelled: int = 0
+
+    @property
+    def ended(self) -> int:
+        """Runs that will not change by themselves."""
+        return self.done + self.failed + self.quarantined + self.cancelled
+
+
+class GridView(_Answer):
+    """A grid and how far it is."""
+
+    id: str
+    name: str | None
+    state: GridState
+    uws_phase: UwsPhase
+    n_runs: int
+    counts: RunCounts
+    progress: float
+    """Share of the runs that have ended."""
+    rate_per_s: float | None
+    """Runs that ended per second, over the latest hundred; None before the first."""
+    eta_seconds: float | None
+    created_at: datetime
+    finished_at: datetime | None
+    cancelled_at: datetime | None
+    request: dict[str, Any]
+    links: dict[str, str]
+
+
+class GridPage(_Answer):
+    """A page of grids, newest first."""
+
+    items: list[GridView]
+    next: str | None
+    """Address of the next page."""
+
+
+class DryRun(_Answer):
+    """What a request would start."""
+
+    n_runs: int
+    labels: list[str]
+    """Labels of the first hundred runs."""
+
+
+class RunError(_Answer):
+    """Why a run has no result."""
+
+    code: str
+    detail: str | None
+
+
+class RunView(_Answer):
+    """A run, in lists."""
+
+    id: str
+    grid_id: str
+    ordinal: int
+    label: str
+    paper_run: int | None
+    state: RunState
+    uws_phase: UwsPhase
+    inputs: dict[str, Any]
+    attempt: int
+    error: RunError | None
+    finished_at: datetime | None
+    links: dict[str, str]
+
+
+class RunPage(_Answer):
+    """A page of a grid's runs in the grid's order."""
+
+    items: list[RunView]
+    next: str | None
+
+
+class Recovered(_Answer):
+    """A recovered quantity of one run; ``bias`` is recovered minus input."""
+
+    mean: float
+    sd: float
+    bias: float | None
+
+
+class EstimateView(_Answer):
+    """What one estimator recovered in one run."""
+
+    magnitude: Recovered
+    r_eff: Recovered
+    n: Recovered
+    q: Recovered
+    position_angle: Recovered
+    draws: int
+    at_bound: int
+    failed: int
+
+
+class LensValue(_Answer):
+    """Posterior of one lens parameter."""
+
+    mean: float
+    sd: float
+    truth: float | None
+
+
+class ResultView(_Answer):
+    """Everything that was stored of a run."""
+
+    estimates: dict[EstimateName, EstimateView]
+    lens: dict[str, LensValue]
+    chain: ChainPayload
+    ln_evidence: float
+    chi2: float
+    degrees_of_freedom: int
+    condition_number: float
+    arc_magnitude: float
+    agn_contrast: float | None
+    surface_brightness: float
+    wall_s: float
+    cpu_s: float
+    stages: list[StagePayload]
+    warnings: list[str]
+    versions: dict[str, str]
+    payload_digest: str
+    engine_digest: str
+    stored_at: datetime
+    figure: str | None
+    """Key of the figure in the artefact store."""
+    products: str | None
+
+
+class AttemptView(_Answer):
+    """One execution of a run, after it ended."""
+
+    number: int
+    generation: int
+    outcome: str
+    code: str | None
+    detail: str | None
+    started_at: datetime
+    ended_at: datetime
+
+
+class RunDetail(RunView):
+    """A run with its specification, its result and its attempts."""
+
+    spec: dict[str, Any]
+    digest: str
+    result: ResultView | None
+    attempts: list[AttemptView]
+
+
+class SummaryValue(_Answer):
+    """One quantity over the runs of one input.
+
+    ``sd`` is the mean of the runs' own standard deviations, ``scatter`` the standard deviation of the recovered means
+    between the runs (None for one run alone).
+    """
+
+    input: float | None
+    mean: float
+    sd: float
+    scatter: float | None
+    bias: float | None
+
+
+class SummaryEstimate(_Answer):
+    """One estimator over the runs of one input."""
+
+    magnitude: SummaryValue
+    r_eff: SummaryValue
+    n: SummaryValue
+    q: SummaryValue
+    position_angle: SummaryValue
+    at_bound: int
+    failed: int
+
+
+class SummaryRow(_Answer):
+    """The runs that share an input (they differ in their seed)."""
+
+    input: dict[str, Any]
+    n_runs: int
+    estimates: dict[EstimateName, SummaryEstimate]
+
+
+class OverallValue(_Answer):
+    """One quantity over all stored runs of a grid: mean bias, its scatter between runs, mean of the runs' sd."""
+
+    bias: float | None
+    bias_scatter: float | None
+    sd: float
+
+
+class OverallEstimate(_Answer):
+    """One estimator over all stored runs of a grid."""
+
+    magnitude: OverallValue
+    r_eff: OverallValue
+    n: OverallValue
+    q: OverallValue
+    position_angle: OverallValue
+
+
+class Summary(_Answer):
+    """Biases of a grid: a row for each input, and all together."""
+
+    grid_id: str
+    state: GridState
+    n_runs: int
+    n_stored: int
+    rows: list[SummaryRow]
+    overall: dict[EstimateName, OverallEstimate]
+    next: str | None
+
+
+class SystemItem(_Answer):
+    """A lens system of the catalogue, in short."""
+
+    name: str
+    camera: str
+    mass_models: dict[str, list[float]]
+    """l_eta of each mass model by its name."""
+    links: dict[str, str]
+
+
+class SystemList(_Answer):
+    """The catalogue's systems."""
+
+    items: list[SystemItem]
+
+
+class SystemView(SystemItem):
+    """A lens system with everything that the catalogue holds of it."""
+
+    facts: dict[str, Any]
+
+
+class CameraItem(_Answer):
+    """A camera of the catalogue."""
+
+    name: str
+    pixel_scale: float
+    drizzled_scale: float
+    zero_point: float
+
+
+class CameraList(_Answer):
+    """The catalogue's cameras."""
+
+    items: list[CameraItem]
+
+
+class EngineView(_Answer):
+    """Which engine this process would run."""
+
+    digest: str
+    version: str
+    presets: list[str]
+
+
+class Health(_Answer):
+    """The process answers."""
+
+    status: Literal["ok"] = "ok"
+
+
+class Readiness(_Answer):
+    """Whether requests are carried out: ``degraded`` accepts grids but nothing computes them now."""
+
+    status: Literal["ready", "degraded"]
+    database: Literal["ok"] = "ok"
+    dispatcher: Literal["ok", "missing"]
+    workers: int
+    beat_at: datetime | None

@@ -1,0 +1,163 @@
+"""How a lease ends: the steps that every transaction which takes a run out of ``leased`` is made of.
+
+Order of locks, everywhere: leader, then grids by id, then runs. A claim locks runs alone and skips locked ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
+
+from service.store.states import CANCEL, OPEN_STATES, REQUEUE, GridState, RunState, move
+from service.store.tables import attempt, event, grid, run
+
+
+class Outcome(StrEnum):
+    """How an attempt ended."""
+
+    DONE = "done"
+    ERROR = "error"
+    WORKER_LOST = "worker_lost"
+    DEADLINE = "deadline"
+    CANCELLED = "cancelled"
+    HANDED_BACK = "handed_back"
+    DISPATCHER_LOST = "dispatcher_lost"
+    FORGOTTEN = "forgotten"
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to run a run once: whoever holds the token may store its result."""
+
+    run_id: str
+    grid_id: str
+    attempt: int
+    token: str
+    generation: int
+    digest: str
+    spec: dict[str, Any]
+    started_at: datetime
+
+    @property
+    def key(self) -> str:
+        """Name of the Dask task: never the same twice, so that Dask takes no old answer for a new one."""
+        return f"{self.run_id}-{self.attempt}-{self.token}"
+
+
+_LEASED = (
+    run.c.id,
+    run.c.grid_id,
+    run.c.attempt,
+    run.c.charged_from,
+    run.c.token,
+    run.c.generation,
+    run.c.leased_at,
+)
+
+
+def held_by(lease: Lease) -> ColumnElement[bool]:
+    """The run of this lease, as long as the lease is valid."""
+    return (run.c.id == lease.run_id) & (run.c.token == lease.token)
+
+
+def lock_grids(connection: Connection, grid_ids: Iterable[str]) -> None:
+    """Let one transaction at a time finish runs of a grid, or two could each take the other's run for unfinished."""
+    wanted = select(grid.c.id).where(grid.c.id.in_(sorted(set(grid_ids)))).order_by(grid.c.id)
+    connection.execute(wanted.with_for_update(key_share=True)).all()
+
+
+def leased(connection: Connection, where: ColumnElement[bool]) -> Sequence[Row[*tuple[Any, ...]]]:
+    """The leased runs that ``where`` picks, they and their grids locked to the end of the transaction."""
+    condition = (run.c.state == RunState.LEASED) & where
+    lock_grids(connection, connection.scalars(select(run.c.grid_id).where(condition).distinct()))
+    return list(connection.execute(select(*_LEASED).where(condition).order_by(run.c.id).with_for_update()).all())
+
+
+def end_attempts(
+    connection: Connection,
+    rows: Sequence[Row[*tuple[Any, ...]]],
+    outcome: Outcome,
+    now: datetime,
+    code: str | None = None,
+    detail: str | None = None,
+) -> None:
+    """Write down how the attempts of leased runs ended; rows are only ever added."""
+    if rows:
+        connection.execute(
+            insert(attempt),
+            [
+                {
+                    "run_id": row.id,
+                    "number": row.attempt,
+                    "token": row.token,
+                    "generation": row.generation,
+                    "started_at": row.leased_at,
+                    "ended_at": now,
+                    "outcome": outcome,
+                    "code": code,
+                    "detail": detail,
+                }
+                for row in rows
+            ],
+        )
+
+
+def requeue(
+    connection: Connection,
+    where: ColumnElement[bool],
+    outcome: Outcome,
+    now: datetime,
+    detail: str | None = None,
+    not_before: datetime | None = None,
+) -> list[str]:
+    """Give leased runs back to the queue, or cancel those whose grid was cancelled meanwhile.
+
+    Without ``not_before`` they keep their place at the head of the queue.
+    """
+    rows = leased(connection, where)
+    end_attempts(connection, rows, outcome, now, detail=detail)
+    ids = [row.id for row in rows]
+    values = {} if not_before is None else {"not_before": not_before}
+    moved = move(connection, REQUEUE, run.c.id.in_(ids), **values)
+    for row in rows:
+        add_event(connection, row.grid_id, "run_requeued", now, row.id, outcome=outcome, attempt=row.attempt)
+    cancelled_grids = select(grid.c.id).where(grid.c.cancelled_at.is_not(None))
+    dropped = move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now)
+    if dropped:
+        close_grids(connection, {row.grid_id for row in rows}, now)
+    return [run_id for run_id in moved if run_id not in dropped]
+
+
+def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) -> None:
+    """Store the final state of each grid whose last run has just ended; the caller holds the grids' locks."""
+    for grid_id in sorted(set(grid_ids)):
+        mine = run.c.grid_id == grid_id
+        if connection.scalar(select(exists().where(mine, run.c.state.in_(sorted(OPEN_STATES))))):
+            continue
+        counted = select(run.c.state, func.count().label("runs")).where(mine).group_by(run.c.state)
+        runs = {row.state: row.runs for row in connection.execute(counted)}
+        state = final_state(runs)
+        connection.execute(update(grid).where(grid.c.id == grid_id).values(state=state, finished_at=now))
+        add_event(connection, grid_id, "grid_finished", now, state=state, runs=runs)
+
+
+def final_state(runs: dict[str, int]) -> GridState:
+    """State of a grid none of whose runs is open."""
+    if runs.get(RunState.CANCELLED):
+        return GridState.CANCELLED
+    if runs.get(RunState.FAILED) or runs.get(RunState.QUARANTINED):
+        return GridState.FAILED
+    return GridState.DONE
+
+
+def add_event(
+    connection: Connection, grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any
+) -> None:
+    """Add to the outbox, in the transaction of the change that the event reports."""
+    row = {"grid_id": grid_id, "run_id": run_id, "kind": kind, "detail": detail, "created_at": now}
+    connection.execute(insert(event), row)

@@ -1,0 +1,228 @@
+"""The queue: claim, store, fail, hand back. Each method is one transaction, so a crash is before it or after it."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import Connection, exists, func, insert, select
+
+from service.identifiers import new_token, utc_now
+from service.payload import ResultPayload
+from service.store.database import Database
+from service.store.leadership import require_generation
+from service.store.leases import (
+    Lease,
+    Outcome,
+    add_event,
+    close_grids,
+    end_attempts,
+    held_by,
+    leased,
+    requeue,
+)
+from service.store.results import result_row
+from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, RunState, move
+from service.store.tables import attempt, grid, result, run
+
+_MAX_DELAY_S = 600.0
+
+
+class Stored(StrEnum):
+    """What became of a result."""
+
+    STORED = "stored"
+    STALE_SAME = "stale_same"
+    STALE_OTHER = "stale_other"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why an attempt failed, and how many more the run is given.
+
+    ``retries`` counts attempts that ended with the same outcome. A run without any left becomes quarantined where
+    ``suspect`` (it may have killed its worker), else failed.
+    """
+
+    outcome: Outcome
+    code: str
+    detail: str
+    retries: int
+    suspect: bool = False
+
+
+class RunQueue:
+    """The queue in the database.
+
+    Parameters
+    ----------
+    database
+        Where it lies.
+    clock
+        The present; tests hold it still.
+    retry_delay_s
+        Back-off before the first retry; doubles with each, with jitter.
+    """
+
+    def __init__(self, database: Database, clock: Callable[[], datetime] = utc_now, retry_delay_s: float = 2.0) -> None:
+        self._database = database
+        self._clock = clock
+        self._retry_delay_s = retry_delay_s
+
+    def waiting(self) -> bool:
+        """Whether a claim would find a run; asked first, because a look needs no lock and an idle queue is the rule."""
+        with self._database.read() as connection:
+            ready = (run.c.state == RunState.QUEUED) & (run.c.not_before <= self._clock())
+            return bool(connection.scalar(select(exists().where(ready))))
+
+    def claim(self, generation: int, limit: int) -> list[Lease]:
+        """Lease up to ``limit`` runs in the order of the queue.
+
+        In one transaction with the look at the leader row, so that a deposed dispatcher cannot claim after the new
+        one has voided its leases.
+
+        Raises
+        ------
+        service.store.leadership.LeadershipLostError
+            Another dispatcher leads.
+        """
+        now, token = self._clock(), new_token()
+        picked = (
+            select(run.c.id)
+            .where(run.c.state == RunState.QUEUED, run.c.not_before <= now)
+            .order_by(run.c.not_before, run.c.id)
+            .limit(limit)
+            .with_for_update(skip_locked=True)
+            .cte("picked")
+            # Materialised, or PostgreSQL may run it again for each row and lock more than ``limit``.
+            .prefix_with("MATERIALIZED", dialect="postgresql")
+        )
+        with self._database.write() as connection:
+            require_generation(connection, generation)
+            ids = move(
+                connection,
+                CLAIM,
+                run.c.id.in_(select(picked.c.id)),
+                token=token,
+                generation=generation,
+                leased_at=now,
+                attempt=run.c.attempt + 1,
+            )
+            columns = (run.c.id, run.c.grid_id, run.c.attempt, run.c.digest, run.c.spec)
+            claimed = select(*columns).where(run.c.id.in_(ids)).order_by(run.c.not_before, run.c.id)
+            return [
+                Lease(row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now)
+                for row in connection.execute(claimed)
+            ]
+
+    def store(self, lease: Lease, payload: ResultPayload) -> Stored:
+        """Store a result if the lease is still valid.
+
+        State, result, attempt and event change together: there is no moment at which a run is done without a result
+        or has two. A lease that is no longer valid leaves everything as it is; its result is compared with the one
+        that was stored instead, because two executions of one run ought to agree.
+        """
+        now = self._clock()
+        with self._database.write() as connection:
+            rows = leased(connection, held_by(lease))
+            if not rows:
+                return self._stale(connection, lease, payload, now)
+            end_attempts(connection, rows, Outcome.DONE, now)
+            move(connection, FINISH, held_by(lease), finished_at=now, error_code=None, error_detail=None)
+            inputs = connection.scalar(select(run.c.inputs).where(run.c.id == lease.run_id))
+            connection.execute(insert(result), result_row(lease, inputs or {}, payload, now))
+            add_event(connection, lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt)
+            close_grids(connection, [lease.grid_id], now)
+            return Stored.STORED
+
+    def fail(self, lease: Lease, failure: Failure) -> RunState | None:
+        """End a failed attempt: back to the queue with a delay while retries are left, else to a terminal state.
+
+        The attempts are counted in the same transaction that decides, so a crash charges nobody twice. Returns the
+        run's new state, None where the lease was no longer valid.
+        """
+        now = self._clock()
+        with self._database.write() as connection:
+            rows = leased(connection, held_by(lease))
+            if not rows:
+                return None
+            charged = self._charged(connection, lease, rows[0].charged_from, failure.outcome)
+            if charged < failure.retries:
+                delay = min(self._retry_delay_s * 2.0**charged, _MAX_DELAY_S) * random.uniform(0.5, 1.5)  # noqa: S311
+                later = now + timedelta(seconds=delay)
+                moved = requeue(connection, held_by(lease), failure.outcome, now, failure.detail, later)
+                return RunState.QUEUED if moved else RunState.CANCELLED
+            end_attempts(connection, rows, failure.outcome, now, failure.code, failure.detail)
+            transition = QUARANTINE if failure.suspect else FAIL
+            reason = {"error_code": failure.code, "error_detail": failure.detail}
+            move(connection, transition, held_by(lease), finished_at=now, **reason)
+            kind = f"run_{transition.target}"
+            add_event(connection, lease.grid_id, kind, now, lease.run_id, attempt=lease.attempt, code=failure.code)
+            close_grids(connection, [lease.grid_id], now)
+            return transition.target
+
+    def hand_back(self, leases: Sequence[Lease]) -> int:
+        """Give runs back uncharged, at a stop; how many of the leases were still valid."""
+        with self._database.write() as connection:
+            wanted = run.c.id.in_([lease.run_id for lease in leases])
+            mine = wanted & run.c.token.in_({lease.token for lease in leases})
+            return len(requeue(connection, mine, Outcome.HANDED_BACK, self._clock()))
+
+    def requeue_lost(self, lease: Lease, outcome: Outcome, detail: str) -> bool:
+        """Give one run back uncharged that went missing through no fault of its own."""
+        with self._database.write() as connection:
+            return bool(requeue(connection, held_by(lease), outcome, self._clock(), detail))
+
+    def requeue_forgotten(self, generation: int, known: Collection[str]) -> list[str]:
+        """Give back runs leased in this generation that the dispatcher does not know of.
+
+        That happens when a claim was committed and the answer to it was lost.
+        """
+        with self._database.write() as connection:
+            unknown = (run.c.generation == generation) & run.c.id.not_in(known)
+            return requeue(connection, unknown, Outcome.FORGOTTEN, self._clock())
+
+    def to_cancel(self, generation: int) -> list[str]:
+        """Ids of runs leased in this generation whose grid has been cancelled."""
+        with self._database.read() as connection:
+            wanted = (
+                select(run.c.id)
+                .join(grid, grid.c.id == run.c.grid_id)
+                .where(run.c.state == RunState.LEASED, run.c.generation == generation)
+                .where(grid.c.cancelled_at.is_not(None))
+            )
+            return list(connection.scalars(wanted))
+
+    def cancel_leased(self, lease: Lease) -> bool:
+        """Cancel a run in flight; a result that comes later finds its lease gone."""
+        now = self._clock()
+        with self._database.write() as connection:
+            rows = leased(connection, held_by(lease))
+            end_attempts(connection, rows, Outcome.CANCELLED, now)
+            moved = move(connection, CANCEL_RUNNING, held_by(lease), finished_at=now)
+            if moved:
+                add_event(connection, lease.grid_id, "run_cancelled", now, lease.run_id, attempt=lease.attempt)
+                close_grids(connection, [lease.grid_id], now)
+            return bool(moved)
+
+    @staticmethod
+    def _charged(connection: Connection, lease: Lease, charged_from: int, outcome: Outcome) -> int:
+        counted = select(func.count()).where(
+            attempt.c.run_id == lease.run_id, attempt.c.outcome == outcome, attempt.c.number > charged_from
+        )
+        return connection.scalar(counted) or 0
+
+    @staticmethod
+    def _stale(connection: Connection, lease: Lease, payload: ResultPayload, now: datetime) -> Stored:
+        wanted = select(result.c.payload_digest).where(result.c.run_id == lease.run_id)
+        stored: Any = connection.scalar(wanted)
+        same = stored is None or stored == payload.digest
+        known = connection.scalar(select(grid.c.id).where(grid.c.id == lease.grid_id))
+        if known is not None:
+            detail = {"attempt": lease.attempt, "same": same}
+            add_event(connection, lease.grid_id, "stale_result", now, lease.run_id, **detail)
+        return Stored.STALE_SAME if same else Stored.STALE_OTHER

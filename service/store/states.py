@@ -1,0 +1,85 @@
+"""States of runs and grids, and the one table of what may become what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, update
+
+from service.store.tables import run
+
+
+class RunState(StrEnum):
+    """Where a run stands."""
+
+    QUEUED = "queued"
+    LEASED = "leased"
+    DONE = "done"
+    FAILED = "failed"
+    QUARANTINED = "quarantined"
+    CANCELLED = "cancelled"
+
+
+class GridState(StrEnum):
+    """Where a grid stands; the first two are told apart by its runs, the others are stored with its last run."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+OPEN_STATES = frozenset({RunState.QUEUED, RunState.LEASED})
+TERMINAL_STATES = frozenset(RunState) - OPEN_STATES
+
+
+@dataclass(frozen=True)
+class Transition:
+    """A change of state: allowed from ``sources`` only."""
+
+    sources: frozenset[RunState]
+    target: RunState
+
+
+def _from(*sources: RunState, to: RunState) -> Transition:
+    return Transition(frozenset(sources), to)
+
+
+CLAIM = _from(RunState.QUEUED, to=RunState.LEASED)
+FINISH = _from(RunState.LEASED, to=RunState.DONE)
+FAIL = _from(RunState.LEASED, to=RunState.FAILED)
+QUARANTINE = _from(RunState.LEASED, to=RunState.QUARANTINED)
+REQUEUE = _from(RunState.LEASED, to=RunState.QUEUED)
+CANCEL = _from(RunState.QUEUED, to=RunState.CANCELLED)
+CANCEL_RUNNING = _from(RunState.LEASED, to=RunState.CANCELLED)
+REVIVE = _from(RunState.FAILED, RunState.QUARANTINED, RunState.CANCELLED, to=RunState.QUEUED)
+
+TRANSITIONS = {
+    "claim": CLAIM,
+    "finish": FINISH,
+    "fail": FAIL,
+    "quarantine": QUARANTINE,
+    "requeue": REQUEUE,
+    "cancel": CANCEL,
+    "cancel_running": CANCEL_RUNNING,
+    "revive": REVIVE,
+}
+
+
+def move(connection: Connection, transition: Transition, *where: ColumnElement[bool], **values: Any) -> list[str]:
+    """Carry out a transition on the runs that ``where`` picks and return the ids of those that it changed.
+
+    Runs in a state that the transition does not allow are left alone: no row, no change. This is the only statement
+    of the service that changes a run's state. The token is cleared unless ``values`` sets one, so a lease ends with
+    the state that it belonged to.
+    """
+    changed = (
+        update(run)
+        .where(run.c.state.in_(sorted(transition.sources)), *where)
+        .values(state=transition.target, **{"token": None, "generation": None, **values})
+        .returning(run.c.id)
+    )
+    return list(connection.scalars(changed))

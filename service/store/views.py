@@ -1,0 +1,139 @@
+"""Rows as the API's models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Row
+
+from service.payload import ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload
+from service.schemas import (
+    UWS_PHASES,
+    AttemptView,
+    EstimateView,
+    GridView,
+    LensValue,
+    Recovered,
+    ResultView,
+    RunCounts,
+    RunDetail,
+    RunError,
+    RunView,
+)
+from service.store.states import GridState, RunState
+from service.store.tables import run
+
+RUN_COLUMNS = tuple(
+    run.c[name]
+    for name in (
+        "id", "grid_id", "ordinal", "label", "paper_run", "state", "inputs",
+        "attempt", "error_code", "error_detail", "finished_at",
+    )
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Recent:
+    """The latest runs that ended: how many, when the first of them began, when the last ended."""
+
+    runs: int
+    began_at: datetime
+    ended_at: datetime
+
+
+def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
+    """A grid with its progress; an unfinished one is running as soon as a run has been started."""
+    runs = RunCounts(**counts)
+    state = GridState(row.state)
+    if state is GridState.QUEUED and (runs.leased or runs.ended):
+        state = GridState.RUNNING
+    rate = None
+    if recent is not None:
+        until = recent.ended_at if row.finished_at else now
+        rate = recent.runs / max((until - recent.began_at).total_seconds(), 1e-3)
+    remaining = runs.queued + runs.leased
+    return GridView(
+        id=row.id,
+        name=row.name,
+        state=state,
+        uws_phase=UWS_PHASES[state],
+        n_runs=row.n_runs,
+        counts=runs,
+        progress=runs.ended / row.n_runs,
+        rate_per_s=rate,
+        eta_seconds=remaining / rate if rate else (0.0 if not remaining else None),
+        created_at=row.created_at,
+        finished_at=row.finished_at,
+        cancelled_at=row.cancelled_at,
+        request=row.request,
+        links={
+            "self": f"/v1/grids/{row.id}",
+            "runs": f"/v1/grids/{row.id}/runs",
+            "summary": f"/v1/grids/{row.id}/summary",
+            "cancel": f"/v1/grids/{row.id}/cancel",
+        },
+    )
+
+
+def run_view(row: Row[Any]) -> RunView:
+    """A run as lists show it."""
+    return RunView(**_run_fields(row))
+
+
+def run_detail(row: Row[Any], found: Row[Any] | None, attempts: Sequence[Row[Any]]) -> RunDetail:
+    """A run with all that belongs to it."""
+    fields = _run_fields(row)
+    result = None if found is None else result_view(found)
+    if result is not None and result.figure is not None:
+        fields["links"]["figure"] = f"/v1/runs/{row.id}/figure"
+    return RunDetail(
+        **fields,
+        spec=row.spec,
+        digest=row.digest,
+        result=result,
+        attempts=[
+            AttemptView(**{name: getattr(ended, name) for name in AttemptView.model_fields}) for ended in attempts
+        ],
+    )
+
+
+def result_view(row: Row[Any]) -> ResultView:
+    """A result, its columns gathered by estimator and lens parameter."""
+    column = row._mapping
+    estimates = {
+        name: EstimateView(
+            **{
+                quantity: Recovered(**{part: column[f"{name}_{quantity}_{part}"] for part in ("mean", "sd", "bias")})
+                for quantity in QUANTITIES
+            },
+            **{part: column[f"{name}_{part}"] for part in ("draws", "at_bound", "failed")},
+        )
+        for name in ESTIMATES
+    }
+    lens = {
+        name: LensValue(**{part: column[f"lens_{name.lower()}_{part}"] for part in ("mean", "sd", "truth")})
+        for name in LENS_PARAMETERS
+        if column[f"lens_{name.lower()}_mean"] is not None
+    }
+    chain = ChainPayload(
+        status=column["chain_status"],
+        **{name: column[name] for name in ChainPayload.model_fields if name != "status"},
+    )
+    plain = [name for name in ResultView.model_fields if name not in {"estimates", "lens", "chain"}]
+    return ResultView(estimates=estimates, lens=lens, chain=chain, **{name: column[name] for name in plain})
+
+
+def _run_fields(row: Row[Any]) -> dict[str, Any]:
+    state = RunState(row.state)
+    error = None if row.error_code is None else RunError(code=row.error_code, detail=row.error_detail)
+    plain = ("id", "grid_id", "ordinal", "label", "paper_run", "inputs", "attempt", "finished_at")
+    return {
+        **{name: getattr(row, name) for name in plain},
+        "state": state,
+        "uws_phase": UWS_PHASES[state],
+        "error": error,
+        "links": {"self": f"/v1/runs/{row.id}", "grid": f"/v1/grids/{row.grid_id}"},
+    }

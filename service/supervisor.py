@@ -1,0 +1,181 @@
+"""``hostlens serve``: API and dispatcher as two processes of one machine, restarted when they die, ended together."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event
+from typing import IO
+
+from service.process import PARENT_FD
+from service.settings import Settings
+from service.store.migrate import upgrade
+
+_LOG = logging.getLogger(__name__)
+_FIRST_DELAY_S = 0.2
+_MAX_DELAY_S = 30.0
+_STEADY_S = 30.0
+_LOOK_S = 0.1
+
+
+@dataclass
+class _Child:
+    """One supervised process and how it has been doing."""
+
+    module: str
+    process: subprocess.Popen[bytes] | None = None
+    started: float = 0.0
+    due: float = 0.0
+    delay: float = _FIRST_DELAY_S
+    starts: int = field(default=0)
+
+
+class Supervisor:
+    """Keeps the processes of one machine running.
+
+    Each child leads a process group of its own: Ctrl-C in a terminal reaches the supervisor alone, and whatever a
+    dead dispatcher leaves behind (Dask's workers) can be ended with it. Each child also watches a pipe from here, so
+    that it ends when the supervisor is killed.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        modules: tuple[str, ...] = ("service.api", "service.dispatcher"),
+        log_folder: Path | None = None,
+    ) -> None:
+        self._settings = settings
+        self._log_folder = log_folder
+        self._children = [_Child(module) for module in modules]
+        self._pipe = os.pipe()
+        os.set_inheritable(self._pipe[0], True)
+
+    def prepare(self) -> None:
+        """Create the data folder and bring the database up to date."""
+        self._settings.make_folders()
+        upgrade(self._settings.database)
+
+    def run(self, stop: Event, started: Callable[[], None] = lambda: None) -> None:
+        """Start the processes and keep them running until ``stop`` is set; none is left afterwards."""
+        try:
+            for child in self._children:
+                self._start(child)
+            started()
+            while not stop.wait(_LOOK_S):
+                for child in self._children:
+                    self._look_after(child)
+        finally:
+            self._end_all()
+
+    def pids(self) -> dict[str, int]:
+        """Process numbers by module, of those that have been started."""
+        return {child.module: child.process.pid for child in self._children if child.process is not None}
+
+    def _start(self, child: _Child) -> None:
+        environment = {**os.environ, PARENT_FD: str(self._pipe[0]), **_as_environment(self._settings)}
+        with self._log(child) as log:
+            child.process = subprocess.Popen(
+                [sys.executable, "-m", child.module],
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                pass_fds=(self._pipe[0],),
+                start_new_session=True,
+            )
+        child.started = time.monotonic()
+        child.starts += 1
+        _LOG.info("%s runs as process %d", child.module, child.process.pid)
+
+    @contextmanager
+    def _log(self, child: _Child) -> Iterator[IO[bytes] | None]:
+        """Where a child writes: a file of its own in the log folder, or this process's own output."""
+        if self._log_folder is None:
+            yield None
+            return
+        with (self._log_folder / f"{child.module}.log").open("ab") as log:
+            yield log
+
+    def _look_after(self, child: _Child) -> None:
+        if child.process is None:
+            if time.monotonic() >= child.due:
+                self._start(child)
+            return
+        if not _has_ended(child.process):
+            return
+        _end_group(child.process)
+        code = child.process.wait()
+        child.process = None
+        if time.monotonic() - child.started > _STEADY_S:
+            child.delay = _FIRST_DELAY_S
+        _LOG.warning("%s ended with %d; next start in %.1f s", child.module, code, child.delay)
+        child.due = time.monotonic() + child.delay
+        child.delay = min(2 * child.delay, _MAX_DELAY_S)
+
+    def _end_all(self) -> None:
+        running = [child.process for child in self._children if child.process is not None]
+        for process in running:
+            with suppress(ProcessLookupError):
+                process.terminate()
+        until = time.monotonic() + self._settings.stop_grace_s
+        while time.monotonic() < until and not all(_has_ended(process) for process in running):
+            time.sleep(_LOOK_S / 2)
+        for process in running:
+            _end_group(process)
+            process.wait()
+        for end in self._pipe:
+            os.close(end)
+
+
+def _has_ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a child has ended, without taking its exit status.
+
+    Until that is taken its number cannot go to another process, and neither can its group's.
+    """
+    if process.returncode is not None:
+        return True
+    return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+
+def _end_group(process: subprocess.Popen[bytes]) -> None:
+    """End whatever is left of a child and of what it started."""
+    if process.returncode is None:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def _as_environment(settings: Settings) -> dict[str, str]:
+    """The settings as the variables that the children read, so that all agree whatever came from the command line."""
+    values = settings.model_dump(mode="json", exclude_none=True)
+    return {f"HOSTLENS_{name.upper()}": str(value) for name, value in values.items()}
+
+
+def require_free(settings: Settings) -> None:
+    """Ask for the port before anything is started; OSError where another process has it.
+
+    Otherwise the API would be started again and again beside the one that is already there.
+    """
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((settings.host, settings.port))
+
+
+def serve(settings: Settings, started: Callable[[], None] = lambda: None) -> None:
+    """Run API and dispatcher until SIGINT or SIGTERM; OSError where the port is taken."""
+    stop = Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    require_free(settings)
+    supervisor = Supervisor(settings)
+    supervisor.prepare()
+    supervisor.run(stop, started)

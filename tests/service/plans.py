@@ -1,0 +1,32 @@
+"""Small grids for the tests."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from service.payload import ResultPayload, read_payload
+from service.requests import GridRequest, plan
+from service.store.grids import GridStore, PlannedRun
+from service.store.leases import Lease
+from tests.service.tasks import synthetic_payload
+
+BODY = {"preset": "h0licow-vi/HE0435", "n": [2], "magnitude": [20.5], "l_eta": [1.0], "r_eff": [0.39]}
+
+
+def body(runs: int, seed: int = 0) -> dict[str, object]:
+    """A request for ``runs`` runs of one input."""
+    return {**BODY, "replicates": runs, "seed": seed}
+
+
+@cache
+def planned(runs: int, seed: int = 0) -> tuple[PlannedRun, ...]:
+    return tuple(plan(GridRequest.model_validate(body(runs, seed)), 100_000))
+
+
+def submit(grids: GridStore, runs: int, seed: int = 0) -> str:
+    """Store a grid; its id."""
+    return grids.create(body(runs, seed), lambda: planned(runs, seed)).grid.id
+
+
+def result_of(lease: Lease) -> ResultPayload:
+    return read_payload(synthetic_payload(lease.spec))

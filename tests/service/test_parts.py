@@ -1,0 +1,209 @@
+"""The smaller parts: payload, worker, endings, settings, artefacts, names of processes, the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import KilledWorker
+from fastapi.testclient import TestClient
+from matplotlib.figure import Figure
+from pydantic import ValidationError
+from typer.testing import CliRunner
+
+from engine.result import ChainSummary, Estimate, LensParameter, Quantity, RunResult, StageTime
+from engine.spec import Analysis, realization_from_dict
+from service.api.app import create_app
+from service.artefacts import ArtefactStore
+from service.cli import app
+from service.dispatcher.endings import clean, read_answer, read_exception
+from service.dispatcher.holder import is_dead, own_name
+from service.identifiers import utc_now
+from service.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
+from service.requests import AnalysisRequest
+from service.settings import Settings
+from service.store.leases import Lease, Outcome
+from service.store.queue import Failure
+from service.worker import call_task, execute
+from tests.service.plans import planned
+from tests.service.tasks import PNG, synthetic_payload
+
+SPEC = planned(1)[0].spec
+
+
+def lease() -> Lease:
+    run = planned(1)[0]
+    return Lease("r", "g", 1, "token", 1, run.digest, run.spec, utc_now())
+
+
+def engine_result(**changes: Any) -> RunResult:
+    one = Quantity(1.0, 0.1, 1.1)
+    pairs = [("paper", "free"), ("paper", "fixed"), ("projected", "free"), ("projected", "fixed")]
+    whole: dict[str, Any] = {
+        "realization_digest": "a" * 64,
+        "engine_digest": "b" * 64,
+        "versions": {"numpy": "2"},
+        "seed": 0,
+        "noise_level": "author",
+        "noise_treatment": "diagonal",
+        "estimates": tuple(Estimate(*pair, one, one, one, one, one, 30, 1, 0) for pair in pairs),  # type: ignore[arg-type]
+        "lens": (LensParameter("theta_E", one), LensParameter("ln_lambda", Quantity(2.0, 0.2))),
+        "chain": ChainSummary("converged", 24, 400, 100, 30.0, 240.0, 0.4, 9600),
+        "ln_evidence": -10.0,
+        "chi2": 5.0,
+        "degrees_of_freedom": 4,
+        "condition_number": 100.0,
+        "arc_magnitude": 18.0,
+        "agn_contrast": None,
+        "surface_brightness": 20.0,
+        "stages": (StageTime("forward", 1.0, 0.5), StageTime("posterior", 2.0, 2.0)),
+    }
+    return RunResult(**(whole | changes))
+
+
+def test_an_engine_result_becomes_a_payload_that_survives_json() -> None:
+    payload = result_payload(engine_result())
+    assert set(payload.estimates) == set(ESTIMATES)
+    assert payload.estimates["paper_free"].n.bias == pytest.approx(-0.1)
+    assert (payload.wall_s, payload.cpu_s) == (3.0, 2.5)
+    again = ResultPayload.model_validate_json(payload.model_dump_json())
+    assert again == payload
+    assert again.digest == payload.digest
+
+
+def test_the_digest_is_of_what_was_found_and_not_of_how_long_it_took() -> None:
+    slow = result_payload(engine_result(stages=(StageTime("forward", 9.0, 9.0),)))
+    assert slow.digest == result_payload(engine_result()).digest
+    assert result_payload(engine_result(chi2=6.0)).digest != slow.digest
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_number_that_is_not_finite_is_no_result(bad: float) -> None:
+    with pytest.raises(InvalidResultError, match="ln_evidence"):
+        result_payload(engine_result(ln_evidence=bad))
+    with pytest.raises(InvalidResultError, match="theta_E"):
+        result_payload(engine_result(lens=(LensParameter("theta_E", Quantity(bad, 0.1)),)))
+
+
+def test_a_result_without_all_estimators_is_no_result() -> None:
+    with pytest.raises(InvalidResultError, match="projected_fixed"):
+        result_payload(engine_result(estimates=engine_result().estimates[:3]))
+
+
+def test_analysis_overrides_follow_the_engine() -> None:
+    assert list(AnalysisRequest.model_fields) == [field.name for field in dataclasses.fields(Analysis)]
+
+
+def test_a_worker_answers_with_data_whatever_happens() -> None:
+    assert call_task("tests.service.tasks:synthetic_payload_of", {}, "x")["error"]["code"] == "error"
+    refused = call_task("tests.service.tasks:moody", {**SPEC, "seed": 3}, "x")["error"]
+    assert (refused["code"], refused["permanent"]) == ("invalid_spec", True)
+    broken = call_task("tests.service.tasks:moody", {**SPEC, "seed": 1}, "x")["error"]
+    assert (broken["code"], broken["permanent"]) == ("error", False)
+
+
+def test_answers_are_judged() -> None:
+    good = {"payload": synthetic_payload(SPEC)}
+    assert read_answer(lease(), good) == read_payload(good["payload"])
+    for answer in (None, {}, {"payload": {}}, {"payload": {**good["payload"], "realization_digest": "0" * 64}}):
+        ending = read_answer(lease(), answer)
+        assert isinstance(ending, Failure)
+        assert (ending.code, ending.retries) == ("invalid_result", 0)
+    killed = read_exception(KilledWorker("key", None, 1))
+    assert (killed.outcome, killed.suspect) == (Outcome.WORKER_LOST, True)
+    assert clean("a\x00b\ud800") == "a\ufffdb?"
+
+
+def test_artefacts_are_named_by_their_content_and_keys_cannot_escape(tmp_path: Path) -> None:
+    store = ArtefactStore(str(tmp_path / "new" / "store"))
+    first, again = store.put(PNG, "png"), store.put(PNG, "png")
+    assert first == again
+    assert store.read(first.key) == Path(store.path(first.key)).read_bytes() == PNG
+    assert len([file for file in tmp_path.rglob("*") if file.is_file()]) == 1
+    with pytest.raises(ValueError, match="not an artefact key"):
+        store.read("../../etc/passwd")
+
+
+def test_a_process_is_known_to_be_dead_only_on_its_own_machine() -> None:
+    mine = own_name()
+    assert not is_dead(mine)
+    place, pid, created = mine.split("|")
+    assert is_dead(f"{place}|{pid}|1.00")
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    child.wait()
+    assert is_dead(f"{place}|{child.pid}|{created}")
+    assert not is_dead(f"elsewhere/0/|{child.pid}|{created}")
+    assert not is_dead("something else")
+    assert str(os.getpid()) == pid
+
+
+def test_settings_are_checked_at_the_door(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValidationError, match="ALLOW_REMOTE"):
+        Settings(host="0.0.0.0")  # noqa: S104 - that it is refused is the point
+    assert Settings(host="0.0.0.0", allow_remote=True).host  # noqa: S104
+    with pytest.raises(ValidationError, match="LEADER_TTL"):
+        Settings(leader_ttl_s=5, heartbeat_s=5)
+    monkeypatch.setenv("HOSTLENS_PORT", "99999")
+    outcome = CliRunner().invoke(app, ["status"])
+    assert outcome.exit_code == 1
+    assert "port" in outcome.output
+
+
+def test_the_command_line_speaks_to_the_api(tmp_path: Path, sqlite_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = Settings(database_url=sqlite_url, data_dir=tmp_path)
+    with TestClient(create_app(settings)) as api:
+        monkeypatch.setattr("service.client.httpx.Client", lambda **_: api)
+        monkeypatch.setattr(api, "close", lambda: None)
+        run = CliRunner()
+        options = ["--preset", "h0licow-vi/HE0435", "--n", "2", "--n", "4", "--l-eta", "1", "--magnitude", "20.5"]
+        made = run.invoke(app, ["submit", *options])
+        assert made.exit_code == 0, made.output
+        grid = made.output.strip()
+        assert grid.startswith("g_")
+        assert "queued: 0/4 stored" in run.invoke(app, ["status", grid]).output
+        assert grid in run.invoke(app, ["status"]).output
+        assert "queued" in run.invoke(app, ["status", grid, "--runs"]).output
+        assert '"n_stored": 0' in run.invoke(app, ["results", grid, "--json"]).output
+        assert "0 of 4 runs stored" in run.invoke(app, ["results", grid]).output
+        assert "4 cancelled" in run.invoke(app, ["cancel", grid]).output
+        refused = run.invoke(app, ["submit", "--preset", "other"])
+        assert refused.exit_code == 1
+        assert "/preset" in refused.output
+
+
+def test_the_command_line_says_so_when_there_is_no_service() -> None:
+    outcome = CliRunner().invoke(app, ["status", "--url", "http://127.0.0.1:1"])
+    assert outcome.exit_code == 1
+    assert "does not answer" in outcome.output
+
+
+def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flat = np.zeros((4, 5))
+    values = {"image": flat, "model": flat, "source_truth": None, "names": ("a", "b")}
+    products = dataclasses.make_dataclass("Products", list(values))(**values)
+    digest = planned(1)[0].digest
+    engine = SimpleNamespace(
+        realization_from_dict=realization_from_dict,
+        run=lambda realization: engine_result(realization_digest=realization.digest, products=products),
+    )
+    figures = SimpleNamespace(run_figure=lambda _: Figure())
+    modules = {"engine": engine, "engine.figures": figures, "numpy": np}
+    monkeypatch.setattr("service.worker.import_module", modules.__getitem__)
+    payload = read_payload(execute(SPEC, str(tmp_path)))
+    assert payload.realization_digest == digest
+    store = ArtefactStore(str(tmp_path))
+    assert payload.figure is not None
+    assert payload.products is not None
+    assert store.read(payload.figure.key).startswith(b"\x89PNG")
+    with np.load(store.path(payload.products.key), allow_pickle=False) as arrays:
+        assert set(arrays) == {"image", "model", "names"}
+        assert arrays["image"].shape == (4, 5)

@@ -1,0 +1,393 @@
+"""The queue keeps its promises on SQLite and on PostgreSQL."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import pytest
+from sqlalchemy import func, select
+from sqlalchemy.exc import IntegrityError
+
+from service.store.database import Database
+from service.store.grids import GridStore, KeyReusedError, NotFoundError
+from service.store.leadership import Leadership, LeadershipLostError
+from service.store.leases import Lease, Outcome
+from service.store.queue import Failure, RunQueue, Stored
+from service.store.states import GridState, RunState
+from service.store.tables import event, result, run
+from tests.service.conftest import Clock
+from tests.service.plans import body, planned, result_of, submit
+
+T = TypeVar("T")
+
+
+def at_once(work: Callable[..., T], arguments: Iterable[Any]) -> list[T]:
+    """Call ``work`` from as many threads at one moment as there are arguments."""
+    each = list(arguments)
+    barrier = threading.Barrier(len(each))
+
+    def start(argument: Any) -> T:
+        barrier.wait()
+        return work(argument)
+
+    with ThreadPoolExecutor(len(each)) as threads:
+        return list(threads.map(start, each))
+
+
+ERROR = Failure(Outcome.ERROR, "error", "it broke", retries=2)
+PERMANENT = Failure(Outcome.ERROR, "invalid_spec", "never", retries=0)
+CRASH = Failure(Outcome.WORKER_LOST, "worker_lost", "gone", retries=2, suspect=True)
+
+
+@pytest.fixture
+def grids(database: Database, clock: Clock) -> GridStore:
+    return GridStore(database, clock)
+
+
+@pytest.fixture
+def queue(database: Database, clock: Clock) -> RunQueue:
+    return RunQueue(database, clock, retry_delay_s=2.0)
+
+
+@pytest.fixture
+def leadership(database: Database, clock: Clock) -> Leadership:
+    return Leadership(database, 30.0, clock)
+
+
+@pytest.fixture
+def generation(leadership: Leadership) -> int:
+    taken = leadership.take("first")
+    assert taken == 1
+    return taken
+
+
+def one(queue: RunQueue, generation: int) -> Lease:
+    (lease,) = queue.claim(generation, 1)
+    return lease
+
+
+def results(database: Database) -> int:
+    with database.read() as connection:
+        return connection.scalar(select(func.count()).select_from(result)) or 0
+
+
+def test_runs_are_claimed_in_the_order_of_their_grids(grids: GridStore, queue: RunQueue, clock: Clock) -> None:
+    Leadership(queue._database, 30.0, clock).take("first")
+    first = submit(grids, 3)
+    clock.advance(1)
+    second = submit(grids, 2, seed=10)
+    leases = [lease for _ in range(5) for lease in queue.claim(1, 1)]
+    assert [lease.grid_id for lease in leases] == [first] * 3 + [second] * 2
+    assert [lease.run_id for lease in leases] == sorted(lease.run_id for lease in leases)
+    assert not queue.waiting()
+    assert queue.claim(1, 10) == []
+
+
+def test_four_dispatching_threads_claim_each_run_once(
+    url: str, grids: GridStore, generation: int, clock: Clock
+) -> None:
+    submit(grids, 120)
+
+    def work(_: int) -> list[str]:
+        database = Database(url)
+        mine = RunQueue(database, clock)
+        claimed = []
+        while leases := mine.claim(generation, 3):
+            claimed += [lease.run_id for lease in leases]
+        database.close()
+        return claimed
+
+    claimed = [run_id for some in at_once(work, range(4)) for run_id in some]
+    # SKIP LOCKED may let a claimer leave while another still holds rows: what is claimed is claimed once all the same.
+    assert set(Counter(claimed).values()) == {1}
+    assert len(claimed) == 120
+
+
+def test_a_stored_run_is_done_and_has_one_result_with_its_inputs(
+    database: Database, grids: GridStore, queue: RunQueue, generation: int
+) -> None:
+    grid_id = submit(grids, 1)
+    lease = one(queue, generation)
+    payload = result_of(lease)
+    assert queue.store(lease, payload) is Stored.STORED
+    found = grids.run(lease.run_id)
+    assert found.state is RunState.DONE
+    assert found.result is not None
+    assert found.result.payload_digest == payload.digest
+    estimate, sent = found.result.estimates["projected_fixed"], payload.estimates["projected_fixed"]
+    assert estimate.r_eff.mean == sent.r_eff.mean
+    assert estimate.r_eff.bias == pytest.approx(sent.r_eff.mean - 0.39)
+    assert found.result.lens["theta_E"].mean == payload.lens["theta_E"].mean
+    assert "gamma1" not in found.result.lens
+    assert [ended.outcome for ended in found.attempts] == ["done"]
+    with database.read() as connection:
+        row = connection.execute(select(result)).one()
+    assert (row.system, row.camera, row.n, row.magnitude, row.seed) == ("HE0435", "WFC3-IR_F160W", 2.0, 20.5, 0)
+    grid = grids.grid(grid_id)
+    assert (grid.state, grid.counts.done, grid.progress, grid.eta_seconds) == (GridState.DONE, 1, 1.0, 0.0)
+
+
+def test_a_result_comes_too_late_once_another_was_stored(
+    database: Database, grids: GridStore, queue: RunQueue, leadership: Leadership, generation: int, clock: Clock
+) -> None:
+    submit(grids, 1)
+    late = one(queue, generation)
+    clock.advance(31)
+    second = leadership.take("second")
+    assert second == 2
+    fresh = one(queue, second)
+    assert fresh.run_id == late.run_id
+    assert fresh.token != late.token
+    assert queue.store(fresh, result_of(fresh)) is Stored.STORED
+    assert queue.store(late, result_of(late)) is Stored.STALE_SAME
+    other = result_of(late).model_copy(update={"chi2": 1.0})
+    assert queue.store(late, other) is Stored.STALE_OTHER
+    assert results(database) == 1
+    assert grids.stale_results() == 2
+    assert [ended.outcome for ended in grids.run(late.run_id).attempts] == ["dispatcher_lost", "done"]
+
+
+def test_two_stores_with_one_lease_at_the_same_time_store_once(
+    url: str, database: Database, grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    submit(grids, 1)
+    lease = one(queue, generation)
+    payload = result_of(lease)
+
+    def work(_: int) -> Stored:
+        mine = Database(url)
+        stored = RunQueue(mine, clock).store(lease, payload)
+        mine.close()
+        return stored
+
+    outcomes = at_once(work, range(4))
+    assert Counter(outcomes) == {Stored.STORED: 1, Stored.STALE_SAME: 3}
+    assert results(database) == 1
+
+
+def test_the_last_two_runs_ending_at_once_finish_the_grid(
+    url: str, grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    def work(lease: Lease) -> None:
+        mine = Database(url)
+        RunQueue(mine, clock).store(lease, result_of(lease))
+        mine.close()
+
+    for repetition in range(5):
+        grid_id = submit(grids, 2, seed=10 * repetition)
+        at_once(work, queue.claim(generation, 2))
+        assert grids.grid(grid_id).state is GridState.DONE
+
+
+def test_a_failed_run_is_tried_twice_more_with_growing_delay(
+    grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    grid_id = submit(grids, 1)
+    for least, most in ((1.0, 3.0), (2.0, 6.0)):
+        assert queue.fail(one(queue, generation), ERROR) is RunState.QUEUED
+        clock.advance(least - 0.01)
+        assert not queue.waiting()
+        clock.advance(most)
+        assert queue.waiting()
+    lease = one(queue, generation)
+    assert queue.fail(lease, ERROR) is RunState.FAILED
+    found = grids.run(lease.run_id)
+    assert found.error is not None
+    assert (found.error.code, found.attempt) == ("error", 3)
+    assert grids.grid(grid_id).state is GridState.FAILED
+
+
+def test_bad_input_fails_at_once(grids: GridStore, queue: RunQueue, generation: int) -> None:
+    submit(grids, 1)
+    assert queue.fail(one(queue, generation), PERMANENT) is RunState.FAILED
+
+
+def test_a_run_that_loses_three_workers_is_quarantined(
+    grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    grid_id = submit(grids, 1)
+    states = []
+    for _ in range(3):
+        states.append(queue.fail(one(queue, generation), CRASH))
+        clock.advance(60)
+    assert states == [RunState.QUEUED, RunState.QUEUED, RunState.QUARANTINED]
+    assert grids.grid(grid_id).counts.quarantined == 1
+
+
+def test_a_run_handed_back_is_charged_nothing_and_keeps_its_place(
+    grids: GridStore, queue: RunQueue, generation: int
+) -> None:
+    submit(grids, 3)
+    for _ in range(5):
+        leases = queue.claim(generation, 2)
+        assert [lease.run_id[-1] for lease in leases] == ["0", "1"]
+        assert queue.hand_back(leases) == 2
+    assert queue.hand_back(leases) == 0
+    assert queue.fail(one(queue, generation), ERROR) is RunState.QUEUED
+
+
+def test_runs_that_the_dispatcher_does_not_know_of_go_back(grids: GridStore, queue: RunQueue, generation: int) -> None:
+    submit(grids, 3)
+    known, *unknown = queue.claim(generation, 3)
+    assert queue.requeue_forgotten(generation, [known.run_id]) == [lease.run_id for lease in unknown]
+    assert queue.requeue_forgotten(generation, [known.run_id]) == []
+    assert queue.store(known, result_of(known)) is Stored.STORED
+
+
+def test_a_deposed_leader_claims_nothing(
+    grids: GridStore, queue: RunQueue, leadership: Leadership, generation: int, clock: Clock
+) -> None:
+    submit(grids, 2)
+    assert leadership.take("second") is None
+    assert leadership.beat(generation, 2)
+    clock.advance(30.5)
+    second = leadership.take("second")
+    assert second == 2
+    assert not leadership.beat(generation, 2)
+    with pytest.raises(LeadershipLostError):
+        queue.claim(generation, 1)
+    assert len(queue.claim(second, 2)) == 2
+
+
+def test_a_leader_known_to_be_dead_is_replaced_at_once(leadership: Leadership, generation: int) -> None:
+    assert leadership.take("second", lambda name: name == "other") is None
+    assert leadership.take("second", lambda name: name == "first") == 2
+    view = leadership.view()
+    assert view is not None
+    assert view.holder == "second"
+
+
+def test_a_leader_that_resigns_is_replaced_at_once(leadership: Leadership, generation: int) -> None:
+    assert leadership.alive() is not None
+    leadership.resign(generation)
+    assert leadership.alive() is None
+    assert leadership.take("second") == 2
+
+
+def test_cancel_ends_queued_runs_at_once_and_running_ones_when_they_are_stopped(
+    grids: GridStore, queue: RunQueue, generation: int
+) -> None:
+    grid_id = submit(grids, 4)
+    running, returned = queue.claim(generation, 2)
+    assert queue.to_cancel(generation) == []
+    assert grids.cancel(grid_id).counts.cancelled == 2
+    assert set(queue.to_cancel(generation)) == {running.run_id, returned.run_id}
+    assert queue.hand_back([returned]) == 0
+    assert grids.grid(grid_id).counts.cancelled == 3
+    assert queue.cancel_leased(running)
+    assert queue.store(running, result_of(running)) is Stored.STALE_SAME
+    grid = grids.grid(grid_id)
+    assert (grid.state, grid.counts.cancelled, grid.uws_phase) == (GridState.CANCELLED, 4, "ABORTED")
+    assert grids.cancel(grid_id) == grid
+
+
+def test_a_result_that_is_there_before_the_stop_is_kept(grids: GridStore, queue: RunQueue, generation: int) -> None:
+    grid_id = submit(grids, 1)
+    lease = one(queue, generation)
+    grids.cancel(grid_id)
+    assert queue.store(lease, result_of(lease)) is Stored.STORED
+    assert grids.grid(grid_id).state is GridState.DONE
+
+
+def test_an_explicit_retry_gives_failed_runs_a_fresh_count(
+    grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    grid_id = submit(grids, 2)
+    first = one(queue, generation)
+    queue.store(first, result_of(first))
+    for _ in range(3):
+        queue.fail(one(queue, generation), ERROR)
+        clock.advance(60)
+    assert grids.grid(grid_id).state is GridState.FAILED
+    assert grids.revive(grid_id) == 1
+    assert grids.grid(grid_id).state is GridState.RUNNING
+    assert queue.fail(one(queue, generation), ERROR) is RunState.QUEUED
+    clock.advance(60)
+    last = one(queue, generation)
+    assert last.attempt == 5
+    queue.store(last, result_of(last))
+    assert grids.grid(grid_id).state is GridState.DONE
+
+
+def test_a_grid_is_stored_whole_or_not_at_all(database: Database, grids: GridStore) -> None:
+    twice = planned(1) * 2
+    with pytest.raises(IntegrityError):
+        grids.create(body(2), lambda: twice)
+    assert grids.grids(10).items == []
+    with database.read() as connection:
+        assert connection.scalar(select(func.count()).select_from(run)) == 0
+        assert connection.scalar(select(func.count()).select_from(event)) == 0
+
+
+def test_many_submissions_with_one_key_make_one_grid(url: str, grids: GridStore, clock: Clock) -> None:
+
+    def work(_: int) -> str:
+        mine = Database(url)
+        made = GridStore(mine, clock).create(body(3), lambda: planned(3), key="k").grid.id
+        mine.close()
+        return made
+
+    made = at_once(work, range(8))
+    assert len(made) == 8
+    assert len(set(made)) == 1
+    assert len(grids.grids(10).items) == 1
+    with pytest.raises(KeyReusedError):
+        grids.create(body(4), lambda: planned(4), key="k")
+
+
+def test_pages_show_each_thing_once(grids: GridStore, clock: Clock) -> None:
+    made = []
+    for seed in range(5):
+        made.append(submit(grids, 5, seed=seed))
+        clock.advance(1)
+    seen, cursor = [], None
+    while True:
+        page = grids.grids(2, cursor)
+        seen += [grid.id for grid in page.items]
+        cursor = page.next
+        if cursor is None:
+            break
+    assert seen == made[::-1]
+    first = grids.runs(made[0], 3)
+    assert first.next == "2"
+    rest = grids.runs(made[0], 3, after=int(first.next))
+    assert [found.ordinal for found in first.items + rest.items] == list(range(5))
+    assert rest.next is None
+    with pytest.raises(NotFoundError):
+        grids.runs("g_" + "0" * 26, 3)
+
+
+def test_rate_and_time_left_follow_the_runs(grids: GridStore, queue: RunQueue, generation: int, clock: Clock) -> None:
+    grid_id = submit(grids, 6)
+    clock.advance(1000)
+    assert grids.grid(grid_id).rate_per_s is None
+    for _ in range(2):
+        leases = queue.claim(generation, 2)
+        clock.advance(10)
+        for lease in leases:
+            queue.store(lease, result_of(lease))
+    grid = grids.grid(grid_id)
+    assert grid.state is GridState.RUNNING
+    assert grid.rate_per_s == pytest.approx(4 / 20)
+    assert grid.eta_seconds == pytest.approx(10)
+
+
+def test_four_writers_at_once_never_find_sqlite_locked(sqlite_url: str, clock: Clock) -> None:
+    grids = GridStore(Database(sqlite_url), clock)
+    Leadership(Database(sqlite_url), 30.0, clock).take("first")
+
+    def work(number: int) -> None:
+        mine = Database(sqlite_url)
+        queue = RunQueue(mine, clock)
+        for repetition in range(25):
+            submit(GridStore(mine, clock), 1, seed=100 * number + repetition)
+            for lease in queue.claim(1, 2):
+                queue.store(lease, result_of(lease))
+        mine.close()
+
+    at_once(work, range(4))
+    assert sum(grid.counts.done for grid in grids.grids(1000).items) == 100
