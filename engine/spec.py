@@ -198,7 +198,7 @@ class Analysis:
     """
 
     source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (30, 30)
-    source_softening: Annotated[float, Field(gt=0.01, le=10.0)] | None = None
+    source_softening: Annotated[float, Field(gt=0.01, le=10.0)] | None = 0.15
     regularisation: RegularisationName = "curvature"
     noise_treatment: NoiseTreatment = "diagonal"
     mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
@@ -208,7 +208,7 @@ class Analysis:
     ray_margin: Annotated[int, Field(ge=0, le=40)] = 4
     psf_radius: Annotated[int, Field(ge=1, le=80)] = 15
     walkers: Annotated[int, Field(ge=18, le=1000)] = 18
-    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 240
+    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 300
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
 
 
