@@ -27,6 +27,7 @@ _LOG = logging.getLogger(__name__)
 _GATHER_S = 30.0
 _CANCEL_LOOK_S = 1.0
 _MAX_BACK_OFF_S = 10.0
+_EMPTY_LOOKS = 3
 
 
 @dataclass
@@ -53,6 +54,7 @@ class Dispatcher:
         self._done: queues.SimpleQueue[str] = queues.SimpleQueue()
         self._endings: deque[Callable[[], object]] = deque()
         self._back_off = 0.0
+        self._empty_looks = 0
         self._due = {"cancel": 0.0, "reconcile": 0.0}
 
     def run(self, stop: Event) -> None:
@@ -162,7 +164,9 @@ class Dispatcher:
     def _reconcile(self) -> None:
         """Compare what is in flight with what Dask and the database think."""
         now = time.monotonic()
-        stranded = self._pool.threads() == 0
+        # Several looks in a row: workers that are away for a moment come back to what they were doing.
+        self._empty_looks = 0 if self._pool.threads() else self._empty_looks + 1
+        stranded = self._empty_looks >= _EMPTY_LOOKS
         for key, flight in list(self._flights.items()):
             lease = flight.lease
             if stranded or is_lost(flight.future):

@@ -56,10 +56,10 @@ class Pool:
         """Worker threads, as they were within the last moment."""
         if time.monotonic() - self._counted > _COUNT_EVERY_S:
             try:
-                workers = self._client.scheduler_info(n_workers=-1)["workers"]
-            except (OSError, KeyError):
-                workers = {}
-            self._threads = sum(worker["nthreads"] for worker in workers.values())
+                # Not scheduler_info(): the client's own timer overwrites its answer with one that lists no workers.
+                self._threads = sum(self._client.nthreads().values())
+            except OSError:
+                self._threads = 0
             self._counted = time.monotonic()
         return self._threads
 

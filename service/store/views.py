@@ -50,11 +50,8 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
     state = GridState(row.state)
     if state is GridState.QUEUED and (runs.leased or runs.ended):
         state = GridState.RUNNING
-    rate = None
-    if recent is not None:
-        until = recent.ended_at if row.finished_at else now
-        rate = recent.runs / max((until - recent.began_at).total_seconds(), 1e-3)
     remaining = runs.queued + runs.leased
+    rate, left = _pace(recent, remaining, now)
     return GridView(
         id=row.id,
         name=row.name,
@@ -64,7 +61,7 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
         counts=runs,
         progress=runs.ended / row.n_runs,
         rate_per_s=rate,
-        eta_seconds=remaining / rate if rate else (0.0 if not remaining else None),
+        eta_seconds=left,
         created_at=row.created_at,
         finished_at=row.finished_at,
         cancelled_at=row.cancelled_at,
@@ -76,6 +73,22 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
             "cancel": f"/v1/grids/{row.id}/cancel",
         },
     )
+
+
+def _pace(recent: Recent | None, remaining: int, now: datetime) -> tuple[float | None, float | None]:
+    """Runs per second and seconds left.
+
+    Measured up to the last end and counted down from there, or the time left would grow while long runs are under
+    way; once it is used up the wait itself is part of the measure.
+    """
+    if recent is None:
+        return None, 0.0 if not remaining else None
+    rate = recent.runs / max((recent.ended_at - recent.began_at).total_seconds(), 1e-3)
+    left = remaining / rate - (now - recent.ended_at).total_seconds()
+    if remaining and left <= 0.0:
+        rate = recent.runs / max((now - recent.began_at).total_seconds(), 1e-3)
+        left = remaining / rate
+    return rate, max(left, 0.0) if remaining else 0.0
 
 
 def run_view(row: Row[Any]) -> RunView:

@@ -157,6 +157,25 @@ def test_a_run_past_its_deadline_is_stopped_and_tried_once_more(database: Databa
     assert (run.state, run.error and run.error.code, run.attempt) == ("failed", "deadline", 2)
 
 
+def test_workers_that_are_away_for_a_moment_keep_their_runs_and_ones_that_stay_away_lose_them(
+    database: Database, tmp_path: Path
+) -> None:
+    pool = InstantPool(tmp_path, "pending", "pending")
+    setting = Setting(database, pool, runs=2, reconcile_s=0.001)
+    setting.run(until=lambda: len(pool.submitted) == 2)
+    pool.threads = lambda: 0  # type: ignore[method-assign]
+    setting.run(steps=2)
+    pool.threads = lambda: 2  # type: ignore[method-assign]
+    setting.run(steps=1)
+    assert setting.grids.grid(setting.grid_id).counts.leased == 2
+    pool.threads = lambda: 0  # type: ignore[method-assign]
+    setting.run(steps=4)
+    assert setting.grids.grid(setting.grid_id).counts.queued == 2
+    del pool.threads
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 2
+
+
 def test_a_stop_hands_back_what_is_in_flight_and_writes_what_has_ended(database: Database, tmp_path: Path) -> None:
     setting = Setting(database, InstantPool(tmp_path, "pending"), runs=4)
     setting.run(until=lambda: len(setting.pool.submitted) >= 2)

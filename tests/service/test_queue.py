@@ -374,6 +374,10 @@ def test_rate_and_time_left_follow_the_runs(grids: GridStore, queue: RunQueue, g
     assert grid.state is GridState.RUNNING
     assert grid.rate_per_s == pytest.approx(4 / 20)
     assert grid.eta_seconds == pytest.approx(10)
+    clock.advance(4)
+    assert grids.grid(grid_id).eta_seconds == pytest.approx(6)
+    clock.advance(16)
+    assert grids.grid(grid_id).eta_seconds == pytest.approx(2 * 40 / 4)
 
 
 def test_four_writers_at_once_never_find_sqlite_locked(sqlite_url: str, clock: Clock) -> None:
