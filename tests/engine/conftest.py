@@ -1,0 +1,26 @@
+"""One simulated observation for all tests that need one: HE0435 with a bright host of n = 2."""
+
+import numpy as np
+import pytest
+
+from engine.scene import Scene, build_scene
+from engine.simulation import Simulation, simulate
+from engine.spec import Analysis, Host, Realization
+
+QUICK = Analysis(source_pixels=(12, 12), max_steps=10, draws=4)
+"""An analysis of seconds, for what does not depend on its quality."""
+
+
+@pytest.fixture(scope="session")
+def realization() -> Realization:
+    return Realization(system="HE0435", l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=20.5), analysis=QUICK)
+
+
+@pytest.fixture(scope="session")
+def scene(realization: Realization) -> Scene:
+    return build_scene(realization)
+
+
+@pytest.fixture(scope="session")
+def simulation(scene: Scene) -> Simulation:
+    return simulate(scene, "author", np.random.default_rng(1))

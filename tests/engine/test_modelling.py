@@ -1,0 +1,129 @@
+"""What is found in an observation before the inversion, without the truth."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine.conventions import rate_to_magnitude
+from engine.errors import ObservationError, PosteriorError
+from engine.inversion.problem import CORE_BOOST, prepare_problem, ring_mask
+from engine.lensing.lens_equation import solve_lens_equation
+from engine.lensing.power_law import PowerLawLens
+from engine.modelling.lens_start import lens_from_positions
+from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.modelling.point_sources import find_point_sources
+from engine.scene import Scene
+from engine.simulation import Simulation
+from engine.spec import Analysis
+
+
+@pytest.fixture(scope="module")
+def fit(simulation: Simulation) -> ParametricFit:
+    return fit_parametric(simulation.observation, agn_images=4)
+
+
+def test_the_agn_images_are_found_within_a_tenth_of_a_pixel(scene: Scene, simulation: Simulation) -> None:
+    observation = simulation.observation
+    found = find_point_sources(
+        observation.image, observation.noise, observation.psf, observation.pixel_scale, len(scene.agn)
+    )
+    for source in scene.agn:
+        nearest = min(found, key=lambda d: math.hypot(d.x - source.x, d.y - source.y))
+        # A parabola through three pixels of a blended image: 0.008 arcsec is a tenth of a pixel.
+        assert math.hypot(nearest.x - source.x, nearest.y - source.y) < 0.008
+        # The host's own light under the AGN counts with it here.
+        assert nearest.flux == pytest.approx(source.flux, rel=0.15)
+
+
+def test_more_images_than_there_are_is_refused(simulation: Simulation) -> None:
+    flat = np.zeros(simulation.observation.shape)
+    with pytest.raises(ObservationError, match="agn"):
+        find_point_sources(flat, flat + 1.0, simulation.observation.psf, 0.08, 2)
+
+
+def test_a_lens_is_found_from_the_positions_of_a_quad_and_of_a_double() -> None:
+    lens = PowerLawLens(1.2, 0.8, 0.7, 2.0)
+    for x, y, number in ((0.02, 0.03, 4), (0.3, 0.25, 2)):
+        images = solve_lens_equation(lens, x, y)
+        assert len(images) == number
+        found, source = lens_from_positions([(image.x, image.y) for image in images])
+        # A double leaves the shape free: the prior decides it, and theta_E absorbs some.
+        assert found.theta_E == pytest.approx(1.2, rel=1e-3 if number == 4 else 0.06)
+        if number == 4:
+            assert found.q == pytest.approx(0.8, abs=0.01)
+            assert math.remainder(found.phi - 0.7, math.pi) == pytest.approx(0.0, abs=0.02)
+            assert np.allclose(source, (x, y), atol=3e-3)
+
+
+def test_one_image_is_too_few_for_a_lens() -> None:
+    with pytest.raises(PosteriorError, match="agn"):
+        lens_from_positions([(1.0, 0.0)])
+
+
+def test_the_parametric_fit_recovers_lens_host_and_agn(scene: Scene, fit: ParametricFit) -> None:
+    # Statistical errors are ten times smaller; what is left is the PSF of the extended light (a drizzled image has
+    # none exactly) and three rays a pixel.
+    assert fit.lens.theta_E == pytest.approx(scene.lens.theta_E, abs=1e-3)
+    assert fit.lens.q == pytest.approx(scene.lens.q, abs=0.01)
+    assert fit.lens.slope == pytest.approx(scene.lens.slope, abs=0.02)
+    assert math.remainder(fit.lens.phi - scene.lens.phi, math.pi) == pytest.approx(0.0, abs=0.02)
+    magnitude = rate_to_magnitude(fit.host.flux, 25.9463)
+    assert magnitude == pytest.approx(20.5, abs=0.06)
+    assert fit.host.r_eff == pytest.approx(0.39, rel=0.06)
+    assert fit.host.n == pytest.approx(2.0, abs=0.15)
+    for source in scene.agn:
+        nearest = min(fit.agn, key=lambda d: math.hypot(d.x - source.x, d.y - source.y))
+        assert math.hypot(nearest.x - source.x, nearest.y - source.y) < 1e-3
+        assert nearest.flux == pytest.approx(source.flux, rel=0.01)
+
+
+def test_exact_point_sources_beat_shifted_stamps_beside_the_agn(
+    scene: Scene, simulation: Simulation, fit: ParametricFit
+) -> None:
+    observation = simulation.observation
+    source = scene.agn[0]
+    stamped = replace(observation, response=None)
+    exact, shifted = observation.point_source(source.x, source.y), stamped.point_source(source.x, source.y)
+    near = ring_mask(observation.shape, 0.08, (source.x, source.y), 0.0, 0.6)
+    error = source.flux * np.abs(exact - shifted)[near] / observation.noise[near]
+    # The reason why an observation carries its exposures: many sigma in the core, one sigma and more around it.
+    assert error.max() > 3.0
+    assert exact.sum() == pytest.approx(shifted.sum(), rel=0.01)
+
+
+def test_the_mask_is_a_ring_with_its_cores_boosted(simulation: Simulation, fit: ParametricFit) -> None:
+    observation = simulation.observation
+    problem = prepare_problem(observation, fit, Analysis())
+    radius = 1.65 * fit.lens.theta_E
+    assert problem.mask.sum() * 0.08**2 == pytest.approx(math.pi * radius**2 * (1 - (0.4 / 1.65) ** 2), rel=0.02)
+    variance = problem.operator.whitened.covariance**2
+    boosted = problem.core[problem.mask]
+    noise = observation.noise[problem.mask]
+    assert np.allclose(variance[~boosted], noise[~boosted] ** 2)
+    assert np.allclose(variance[boosted], noise[boosted] ** 2 * (1 + CORE_BOOST**2))
+    assert problem.amplitude_names == ("agn1", "agn2", "agn3", "agn4", "deflector", "background")
+
+
+def test_the_noise_treatments_differ_as_they_say(simulation: Simulation, fit: ParametricFit) -> None:
+    observation = simulation.observation
+    paper = prepare_problem(observation, fit, Analysis(noise_treatment="paper_code"))
+    clear = ~paper.core[paper.mask]
+    expected = observation.noise**2 + 0.01 * np.abs(observation.image)
+    assert np.allclose(paper.operator.whitened.covariance[clear] ** 2, expected[paper.mask][clear])
+    full = prepare_problem(observation, fit, Analysis(noise_treatment="covariance"))
+    factor = full.operator.whitened.covariance
+    assert factor.shape == (paper.mask.sum(),) * 2
+    variance = (factor**2).sum(axis=1)
+    assert np.allclose(variance[clear], observation.noise[paper.mask][clear] ** 2, rtol=1e-6)
+    with pytest.raises(ObservationError, match="covariance"):
+        prepare_problem(replace(observation, covariance=None), fit, Analysis(noise_treatment="covariance"))
+
+
+def test_a_ring_without_valid_pixels_is_refused(simulation: Simulation, fit: ParametricFit) -> None:
+    observation = simulation.observation
+    corner = np.zeros(observation.shape, dtype=bool)
+    corner[0, 0] = True
+    with pytest.raises(ObservationError, match="mask"):
+        prepare_problem(replace(observation, valid=corner), fit, Analysis())

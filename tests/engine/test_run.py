@@ -1,0 +1,137 @@
+"""A whole run: what comes back, and that it comes back the same."""
+
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import STAGES, Analysis, Host, Realization, RunResult, SpecError, generator, measure, run
+from engine.figures import run_figure
+from engine.simulation import Simulation
+
+
+@pytest.fixture(scope="module")
+def result(realization: Realization) -> RunResult:
+    return run(realization)
+
+
+def test_a_run_reports_everything_finite(result: RunResult) -> None:
+    assert [(e.estimator, e.index_prior) for e in result.estimates] == [
+        ("paper", "free"),
+        ("paper", "fixed"),
+        ("projected", "free"),
+        ("projected", "fixed"),
+    ]
+    for estimate in result.estimates:
+        for quantity in (estimate.magnitude, estimate.r_eff, estimate.n, estimate.q, estimate.position_angle):
+            assert math.isfinite(quantity.mean)
+            assert math.isfinite(quantity.sd)
+            assert quantity.bias is not None
+            assert quantity.truth is not None
+    assert result.estimate("paper", "fixed").n.bias == 0.0
+    assert [p.name for p in result.lens] == ["theta_E", "q", "phi", "slope", "x", "y", "ln_lambda"]
+    assert [stage.stage for stage in result.stages] == list(STAGES)
+    for number in (result.ln_evidence, result.chi2, result.condition_number, result.arc_magnitude):
+        assert math.isfinite(number)
+    assert result.chain.evaluations > 100
+    assert len(result.engine_digest) == 64
+
+
+def test_a_chain_too_short_is_said_to_be(result: RunResult) -> None:
+    assert result.chain.status == "not_converged"
+    assert any("chain" in warning for warning in result.warnings)
+
+
+def test_the_host_and_its_surroundings_are_as_the_paper_defines_them(result: RunResult) -> None:
+    # The catalogue's magnification of this host is 2.64 mag, and the AGN's total is 18.26.
+    assert result.arc_magnitude == pytest.approx(20.5 - 2.64, abs=0.03)
+    assert result.agn_contrast == pytest.approx(18.26 - result.arc_magnitude, abs=0.02)
+    assert result.surface_brightness == pytest.approx(20.5 + 2.5 * math.log10(2 * math.pi * 0.39**2), abs=1e-9)
+
+
+def test_even_a_coarse_reconstruction_finds_the_host(result: RunResult) -> None:
+    # 12 x 12 source pixels and ten steps: the estimators are within half a magnitude nonetheless.
+    assert abs(result.estimate("projected", "free").magnitude.bias or 9.0) < 0.5
+    assert abs(result.estimate("paper", "free").magnitude.bias or 9.0) < 0.7
+
+
+def test_the_same_realization_gives_the_same_bits(realization: Realization, result: RunResult) -> None:
+    again = run(realization)
+    assert again.estimates == result.estimates
+    assert again.lens == result.lens
+    assert again.products is not None
+    assert result.products is not None
+    assert np.array_equal(again.products.source, result.products.source)
+    assert np.array_equal(again.products.chain, result.products.chain)
+
+
+def test_one_worker_and_two_give_the_same_bits(realization: Realization, result: RunResult) -> None:
+    from distributed import Client, LocalCluster
+
+    other = replace(realization, seed=1)
+    for workers in (1, 2):
+        with (
+            LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+            futures = client.map(run, [realization, other], pure=False)
+            first, second = client.gather(futures)
+        assert first.estimates == result.estimates
+        assert first.lens == result.lens
+        assert second.estimates != result.estimates
+
+
+def test_progress_names_the_stages_in_order(realization: Realization) -> None:
+    seen: list[str] = []
+    run(realization, lambda stage, fraction: seen.append(stage) if stage not in seen else None)
+    assert seen == list(STAGES)
+
+
+def test_an_observation_without_a_truth_has_no_bias(simulation: Simulation, realization: Realization) -> None:
+    found = measure(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
+    assert [(e.estimator, e.index_prior) for e in found.estimates] == [("paper", "free"), ("projected", "free")]
+    assert all(estimate.magnitude.bias is None for estimate in found.estimates)
+    assert all(parameter.value.truth is None for parameter in found.lens)
+
+
+def test_the_truth_changes_nothing_but_the_biases(simulation: Simulation, realization: Realization) -> None:
+    from engine.run import Truth
+    from engine.scene import build_scene
+
+    scene = build_scene(realization)
+    blind = measure(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
+    told = measure(
+        simulation.observation,
+        realization.analysis,
+        generator(realization, 1),
+        agn_images=4,
+        truth=Truth(scene.lens, scene.host),
+    )
+    assert [e.magnitude.mean for e in blind.estimates] == [e.magnitude.mean for e in told.estimates]
+    assert np.array_equal(blind.products.chain, told.products.chain)
+
+
+def test_a_slope_without_a_mass_model_is_refused_by_field() -> None:
+    with pytest.raises(SpecError) as caught:
+        run(Realization(system="HE0435", l_eta=0.9, host=Host(n=2.0, r_eff=0.39, magnitude=21.0)))
+    assert caught.value.field == "l_eta"
+
+
+def test_the_figure_shows_six_panels(result: RunResult) -> None:
+    figure = run_figure(result)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=60)
+    assert data.getvalue().startswith(b"\x89PNG")
+    # Six panels and their colour bars.
+    assert len(figure.axes) == 12
+    with pytest.raises(ValueError, match="products"):
+        run_figure(replace(result, products=None))
+
+
+def test_the_defaults_are_those_of_the_paper_where_it_states_them() -> None:
+    analysis = Analysis()
+    assert analysis.source_pixels == (30, 30)
+    assert analysis.regularisation == "curvature"
+    assert analysis.draws == 30
