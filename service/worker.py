@@ -80,10 +80,10 @@ def _products(result: RunResult, artefacts: ArtefactStore) -> ArtefactPayload | 
 
 
 def _is_permanent(error: Exception) -> bool:
-    """Whether another attempt cannot help: what is asked for is not acceptable, or what was found is not finite."""
+    """Whether another attempt cannot help: the engine gives the same answer, errors included, to the same spec."""
     # By name, because importing the engine's errors would load the engine where the task is not the engine's.
     names = {kind.__name__ for kind in type(error).__mro__}
-    return not names.isdisjoint({"SpecError", "ObservationError", "InvalidResultError"})
+    return not names.isdisjoint({"EngineError", "InvalidResultError"})
 
 
 def _error_code(error: Exception) -> str:

@@ -27,6 +27,7 @@ _FREEDOM = 10.0
 _INDEPENDENCE_SHARE = 0.9
 _BURN_IN_ROUNDS, _BURN_IN_STEPS = 2, 20
 _CHUNK = 15
+_WINDOW = 5
 AUTOCORRELATION_TIMES = 50.0
 """A chain shorter than this many autocorrelation times is not called converged (emcee's own rule)."""
 
@@ -89,12 +90,22 @@ def _start(target: Target, proposal: _IndependenceProposal, walkers: int, random
 
 
 def autocorrelation_time(samples: FloatArray) -> float:
-    """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters)."""
-    if np.any(np.ptp(samples, axis=0) == 0.0):
-        # A walker that has not moved yet has no autocorrelation to measure.
+    """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters).
+
+    The autocovariance about the mean of the whole ensemble is averaged over the walkers before it is normalised, so
+    that a walker that is stuck counts as what it is. Infinite where nothing has moved.
+    """
+    steps = samples.shape[0]
+    away = samples - samples.mean(axis=(0, 1))
+    spectrum = np.fft.rfft(away, n=2 * steps, axis=0)
+    covariance = np.fft.irfft(spectrum * spectrum.conj(), axis=0)[:steps].mean(axis=1)
+    if not (covariance[0] > 0).all():
         return math.inf
-    times = emcee.autocorr.integrated_time(samples, tol=0, has_walkers=True)
-    return float(np.max(times)) if np.all(np.isfinite(times)) else math.inf
+    times = 2.0 * np.cumsum(covariance / covariance[0], axis=0) - 1.0
+    # Sokal's window: the first lag beyond five autocorrelation times, the last one where the chain is shorter.
+    beyond = np.arange(steps)[:, None] >= _WINDOW * times
+    window = np.where(beyond.any(axis=0), beyond.argmax(axis=0), steps - 1)
+    return float(np.take_along_axis(times, window[None, :], axis=0).max())
 
 
 def run_chain(
@@ -111,7 +122,7 @@ def run_chain(
     Raises
     ------
     PosteriorError
-        No walker finds a place inside the prior.
+        No walker finds a place inside the prior, or none ever moves.
     """
     random = np.random.RandomState(int(rng.integers(2**32)))
     proposal = _IndependenceProposal(laplace.mean, laplace.covariance)
@@ -133,6 +144,8 @@ def run_chain(
         tau = autocorrelation_time(sampler.get_chain())
         if progress is not None:
             progress(min(1.0, steps / min(float(max_steps), AUTOCORRELATION_TIMES * tau)))
+    if not math.isfinite(tau):
+        raise PosteriorError(f"chain: no proposal was accepted in {steps} steps of {walkers} walkers")
     status: ChainStatus = "converged" if steps >= AUTOCORRELATION_TIMES * tau else "not_converged"
     summary = ChainSummary(
         status=status,

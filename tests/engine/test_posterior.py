@@ -88,6 +88,21 @@ def test_the_autocorrelation_time_of_independent_samples_is_one() -> None:
     assert autocorrelation_time(np.zeros((10, 4, 2))) == math.inf
 
 
+def test_the_autocorrelation_time_of_a_markov_chain_is_the_textbook_one() -> None:
+    # An AR(1) process with coefficient a has tau = (1 + a)/(1 - a).
+    rng, a = np.random.default_rng(1), 0.8
+    samples = np.zeros((20_000, 4, 1))
+    for k in range(1, samples.shape[0]):
+        samples[k] = a * samples[k - 1] + rng.standard_normal((4, 1))
+    assert autocorrelation_time(samples) == pytest.approx(9.0, rel=0.1)
+
+
+def test_a_walker_that_is_stuck_lengthens_the_autocorrelation_time() -> None:
+    samples = np.random.default_rng(0).normal(size=(400, 8, 1))
+    samples[:, 0] = 3.0
+    assert 5.0 < autocorrelation_time(samples) < math.inf
+
+
 def test_the_strength_that_maximises_the_evidence_is_found() -> None:
     operator = Case(amplitudes=1).operator()
     target = Target(operator, flat_prior(LENS, 0.0, shear=True), SourceModel((9, 9)))

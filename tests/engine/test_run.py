@@ -73,7 +73,7 @@ def test_one_worker_and_two_give_the_same_bits(realization: Realization, result:
     other = replace(realization, seed=1)
     for workers in (1, 2):
         with (
-            LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+            LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
             Client(cluster) as client,
         ):
             futures = client.map(run, [realization, other], pure=False)
@@ -85,7 +85,7 @@ def test_one_worker_and_two_give_the_same_bits(realization: Realization, result:
 
 def test_progress_names_the_stages_in_order(realization: Realization) -> None:
     seen: list[str] = []
-    run(realization, lambda stage, fraction: seen.append(stage) if stage not in seen else None)
+    run(realization, lambda stage, _: seen.append(stage) if stage not in seen else None)
     assert seen == list(STAGES)
 
 
