@@ -19,8 +19,9 @@ from threadpoolctl import threadpool_limits
 from engine.conventions import rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.imaging.observation import Observation
-from engine.inversion.evidence import Inversion, SourceModel
+from engine.inversion.evidence import Inversion
 from engine.inversion.problem import Problem, prepare_problem
+from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, mean_surface_brightness
 from engine.modelling.parametric import fit_parametric

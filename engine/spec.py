@@ -194,11 +194,12 @@ class Analysis:
     ``core_radius`` [arcsec] is the region round each AGN image whose noise is boosted to be effectively infinite;
     ``subrays`` rays are traced along each side of an image pixel; ``ray_margin`` [pixels] is how far outside the
     mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid,
-    evenly spaced where ``source_softening`` is None, else crowded round the AGN within that fraction of its half-width.
+    evenly spaced where ``source_softening`` is None, else crowded round the AGN within that fraction of its half-width;
+    ``walkers`` walk the chain, or twice as many as there are parameters where that is more.
     """
 
     source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (30, 30)
-    source_softening: Annotated[float, Field(gt=0.01, le=10.0)] | None = 0.15
+    source_softening: Annotated[float, Field(gt=0.01, le=1e3)] | None = 0.5
     regularisation: RegularisationName = "curvature"
     noise_treatment: NoiseTreatment = "diagonal"
     mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
@@ -207,7 +208,7 @@ class Analysis:
     subrays: Annotated[int, Field(ge=1, le=8)] = 2
     ray_margin: Annotated[int, Field(ge=0, le=40)] = 4
     psf_radius: Annotated[int, Field(ge=1, le=80)] = 15
-    walkers: Annotated[int, Field(ge=18, le=1000)] = 18
+    walkers: Annotated[int, Field(ge=4, le=1000)] = 14
     max_steps: Annotated[int, Field(ge=10, le=200_000)] = 300
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
 

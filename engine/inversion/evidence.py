@@ -14,28 +14,19 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.inversion.mapping import Mapping, SourceGrid, map_rays
 from engine.inversion.operator import BLOCK, Operator
-from engine.inversion.regularisation import add_regularisation, ln_determinant
+from engine.inversion.regularisation import SourceModel, add_regularisation, ln_determinant
 from engine.lensing.power_law import PowerLawLens, kernel_arguments
-from engine.spec import RegularisationName
 
 MAX_CONDITION = 1e14
 """Beyond this the solution has lost all but two digits."""
 
 
 @dataclass(frozen=True)
-class SourceModel:
-    """How the source is described: (ny, nx) nodes, the regularisation, and the crowding of the nodes (None: even)."""
-
-    shape: tuple[int, int] = (30, 30)
-    regularisation: RegularisationName = "curvature"
-    softening: float | None = None
-
-
-@dataclass(frozen=True)
 class Inversion:
     """A solved inversion.
 
-    ``source`` is (ny, nx), e-/s per arcsec^2; ``factor`` the lower Cholesky factor of A; ``curvature`` F and
+    ``source`` is (ny, nx), e-/s per arcsec^2; ``factor`` the upper Cholesky factor of A
+    (its lower triangle is not used); ``curvature`` F and
     ``data_vector`` D of the source alone, amplitudes marginalised.
     """
 
@@ -50,12 +41,12 @@ class Inversion:
 
     def draw_source(self, rng: np.random.Generator) -> FloatArray:
         """A draw (ny, nx) from the posterior of the source given lens and lambda: mean plus A^(-1/2) noise."""
-        noise, _ = lapack.dtrtrs(self.factor, rng.standard_normal(self.source.size), lower=1, trans=1)
+        noise, _ = lapack.dtrtrs(self.factor, rng.standard_normal(self.source.size), lower=0)
         return np.asarray(self.source + noise.reshape(self.grid.shape))
 
     def source_variance(self) -> FloatArray:
         """Posterior variance (ny, nx) of the source pixels: the diagonal of A^-1."""
-        inverse, _ = lapack.dpotri(self.factor, lower=1)
+        inverse, _ = lapack.dpotri(self.factor, lower=0)
         return np.asarray(np.diag(inverse).reshape(self.grid.shape))
 
 
@@ -96,61 +87,68 @@ def _curvature(
     return g
 
 
-def _factorise(
-    operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel
-) -> tuple[Mapping, FloatArray, FloatArray, FloatArray, FloatArray]:
-    mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening)
-    n = model.shape[0] * model.shape[1]
-    f = _curvature(operator.half_w, mapping.columns, mapping.weights, mapping.entries, n)
+@dataclass(frozen=True)
+class _Solved:
+    """An inversion up to its solution: ``factor`` is the upper Cholesky factor of A in Fortran order."""
+
+    mapping: Mapping
+    data_vector: FloatArray
+    factor: FloatArray
+    solution: FloatArray
+
+
+def _solve(operator: Operator, mapping: Mapping, f: FloatArray, ln_lambda: float, model: SourceModel) -> _Solved:
+    """Factorise A = F + lambda H and solve; ``f`` (valid in its lower triangle) is overwritten."""
     d = mapping.transpose(operator.wd)
-    a = np.asfortranarray(f)
-    add_regularisation(a, model.regularisation, model.shape, math.exp(ln_lambda))
-    factor, info = lapack.dpotrf(a, lower=1, clean=1, overwrite_a=1)
+    add_regularisation(f, model, math.exp(ln_lambda))
+    # Seen in Fortran order, as LAPACK wants it, the lower triangle of f is the upper one: no copy is made.
+    factor, info = lapack.dpotrf(f.T, lower=0, clean=0, overwrite_a=1)
     if info != 0:
         raise InversionError(
-            f"A = F + lambda H: not positive definite at pivot {info} of {n} (ln lambda {ln_lambda:.3g}); "
+            f"A = F + lambda H: not positive definite at pivot {info} of {d.size} (ln lambda {ln_lambda:.3g}); "
             "a larger lambda or fewer source pixels are needed"
         )
-    solution, _ = lapack.dpotrs(factor, d, lower=1)
-    return mapping, f, d, factor, solution
+    solution, _ = lapack.dpotrs(factor, d, lower=0)
+    return _Solved(mapping, d, factor, solution)
 
 
-def _ln_evidence(
-    operator: Operator, model: SourceModel, ln_lambda: float, factor: FloatArray, quadratic: float
-) -> float:
+def _map_and_curve(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[Mapping, FloatArray]:
+    mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening)
     n = model.shape[0] * model.shape[1]
-    ln_a = 2.0 * float(np.log(np.diag(factor)).sum())
-    ln_h = ln_determinant(model.regularisation, model.shape)
-    return -0.5 * (operator.dd - quadratic) - 0.5 * ln_a + 0.5 * ln_h + 0.5 * n * ln_lambda + operator.ln_constant
+    return mapping, _curvature(operator.half_w, mapping.columns, mapping.weights, mapping.entries, n)
 
 
-def ln_evidence(
-    operator: Operator,
-    lens: PowerLawLens,
-    ln_lambda: float,
-    model: SourceModel,
-) -> float:
+def _ln_evidence(operator: Operator, model: SourceModel, ln_lambda: float, solved: _Solved) -> float:
+    n = solved.solution.size
+    quadratic = float(solved.data_vector @ solved.solution)
+    ln_a = 2.0 * float(np.log(np.diag(solved.factor)).sum())
+    return (
+        -0.5 * (operator.dd - quadratic)
+        - 0.5 * ln_a
+        + 0.5 * ln_determinant(model)
+        + 0.5 * n * ln_lambda
+        + operator.ln_constant
+    )
+
+
+def ln_evidence(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> float:
     """Ln Z of the data given lens and ln lambda.
 
     An InversionError says what to change where A is not positive definite.
     """
-    _, _, d, factor, solution = _factorise(operator, lens, ln_lambda, model)
-    return _ln_evidence(operator, model, ln_lambda, factor, float(d @ solution))
+    mapping, f = _map_and_curve(operator, lens, model)
+    return _ln_evidence(operator, model, ln_lambda, _solve(operator, mapping, f, ln_lambda, model))
 
 
-def invert(
-    operator: Operator,
-    lens: PowerLawLens,
-    ln_lambda: float,
-    model: SourceModel,
-) -> Inversion:
+def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> Inversion:
     """Solve the inversion and keep all of it; an InversionError tells where it cannot be trusted."""
-    mapping, f, d, factor, solution = _factorise(operator, lens, ln_lambda, model)
-    f = np.tril(f) + np.tril(f, -1).T
-    full = f.copy()
-    add_regularisation(full, model.regularisation, model.shape, math.exp(ln_lambda))
-    norm = float(np.abs(np.tril(full) + np.tril(full, -1).T).sum(axis=0).max())
-    reciprocal, _ = lapack.dpocon(factor, norm, uplo="L")
+    mapping, f = _map_and_curve(operator, lens, model)
+    curvature = np.tril(f) + np.tril(f, -1).T
+    a = np.tril(f)
+    add_regularisation(a, model, math.exp(ln_lambda))
+    norm = float(np.abs(a + np.tril(a, -1).T).sum(axis=0).max())
+    solved = _solve(operator, mapping, f, ln_lambda, model)
+    reciprocal, _ = lapack.dpocon(solved.factor, norm, uplo="U")
     condition = math.inf if reciprocal == 0.0 else 1.0 / float(reciprocal)
     if condition > MAX_CONDITION:
         raise InversionError(
@@ -158,12 +156,12 @@ def invert(
             "a larger lambda, fewer source pixels or a wider mask are needed"
         )
     return Inversion(
-        ln_evidence=_ln_evidence(operator, model, ln_lambda, factor, float(d @ solution)),
+        ln_evidence=_ln_evidence(operator, model, ln_lambda, solved),
         grid=mapping.grid,
         mapping=mapping,
-        source=solution.reshape(model.shape),
-        factor=factor,
-        curvature=f,
-        data_vector=d,
+        source=solved.solution.reshape(model.shape),
+        factor=solved.factor,
+        curvature=curvature,
+        data_vector=solved.data_vector,
         condition_number=condition,
     )

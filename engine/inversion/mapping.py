@@ -6,7 +6,6 @@ of the mask, with nodes on its edges. A ray outside the rectangle carries no lig
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
+from engine.inversion.nodes import spaced_nodes
 from engine.lensing.power_law import trace_rays
 
 
@@ -197,17 +197,6 @@ def _fill(
         entries[pixel] = used
 
 
-def _nodes(low: float, high: float, n: int, centre: float, softening: float | None) -> FloatArray:
-    """N nodes from low to high: even, or with a spacing that widens away from ``centre`` as cosh (sinh nodes)."""
-    if softening is None:
-        return np.linspace(low, high, n)
-    s = softening * 0.5 * (high - low)
-    t = np.linspace(math.asinh((low - centre) / s), math.asinh((high - centre) / s), n)
-    nodes = centre + s * np.sinh(t)
-    nodes[0], nodes[-1] = low, high
-    return np.asarray(nodes)
-
-
 @kernel
 def _apply(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], source: FloatArray
@@ -260,7 +249,9 @@ def map_rays(
             np.ascontiguousarray(rays.anchors[:, 0]), np.ascontiguousarray(rays.anchors[:, 1]), *lens_arguments, ax, ay
         )
         centre_x, centre_y = float(ax.mean()), float(ay.mean())
-    grid = SourceGrid(_nodes(left, right, nx, centre_x, softening), _nodes(bottom, top, ny, centre_y, softening))
+    grid = SourceGrid(
+        spaced_nodes(left, right, nx, centre_x, softening), spaced_nodes(bottom, top, ny, centre_y, softening)
+    )
     columns = np.empty((rays.pixels, 4 * per_pixel), dtype=np.int32)
     weights = np.empty((rays.pixels, 4 * per_pixel))
     entries = np.empty(rays.pixels, dtype=np.int32)

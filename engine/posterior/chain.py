@@ -124,6 +124,8 @@ def run_chain(
     PosteriorError
         No walker finds a place inside the prior, or none ever moves.
     """
+    # emcee wants twice as many walkers as dimensions at least.
+    walkers = max(walkers, 2 * laplace.mean.size)
     random = np.random.RandomState(int(rng.integers(2**32)))
     proposal = _IndependenceProposal(laplace.mean, laplace.covariance)
     moves = [

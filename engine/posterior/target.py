@@ -9,8 +9,9 @@ import numpy as np
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError
-from engine.inversion.evidence import Inversion, SourceModel, invert, ln_evidence
+from engine.inversion.evidence import Inversion, invert, ln_evidence
 from engine.inversion.operator import Operator
+from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
 
 LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")

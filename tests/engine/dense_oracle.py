@@ -5,10 +5,9 @@ import math
 import numpy as np
 
 from engine.inversion.blurring import blurring_matrix
-from engine.inversion.evidence import SourceModel
 from engine.inversion.mapping import cast_rays, map_rays
 from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.inversion.regularisation import regularisation_matrix
+from engine.inversion.regularisation import SourceModel, regularisation_matrix
 from engine.lensing.power_law import PowerLawLens, kernel_arguments
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
@@ -75,7 +74,7 @@ class Case:
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance
         inverse = np.linalg.inv(c)
-        h = regularisation_matrix(model.regularisation, model.shape)
+        h = regularisation_matrix(model)
         a = g.T @ inverse @ g
         a[:n, :n] += math.exp(ln_lambda) * h
         d = g.T @ inverse @ self.data

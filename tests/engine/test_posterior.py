@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
-from engine.inversion.evidence import SourceModel
+from engine.inversion.regularisation import SourceModel
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Prior, Target, flat_prior

@@ -7,8 +7,9 @@ import pytest
 
 from engine.conventions import rate_to_magnitude
 from engine.errors import InversionError
-from engine.inversion.evidence import Inversion, SourceModel, invert
+from engine.inversion.evidence import Inversion, invert
 from engine.inversion.mapping import SourceGrid
+from engine.inversion.regularisation import SourceModel
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.refit import SersicFit, SourceDraw, fit_draws, profile_on_grid, summarise
 from tests.engine.dense_oracle import LENS, Case
