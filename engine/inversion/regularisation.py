@@ -15,8 +15,8 @@ source may change on the scale of the grid. With sides h_x, h_y the row of D_k a
 
     (h_x h_y / h^2) (h / h_x)^(2k),
 
-which is one on an even grid. The sides are those of the nominal grid, centred and with cells of one on average, so that
-H does not depend on the lens and its determinant is computed once. A change of the grid's size with the lens parameters only
+which is one on an even grid. The sides are those of the nominal grid, centred and with cells of one on average: H does
+not depend on the lens, and its determinant is computed once. A change of the grid's size with the lens parameters only
 rescales lambda, which is free.
 """
 
