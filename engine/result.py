@@ -114,6 +114,7 @@ class Products:
 class RunResult:
     """The outcome of one run.
 
+    ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.
     ``arc_magnitude`` is the AB magnitude of the lensed host in the image plane, ``agn_contrast`` AGN minus arc
     magnitude, ``surface_brightness`` the host's mean surface brightness inside r_eff [mag arcsec^-2] (the paper's
     section 5).

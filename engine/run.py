@@ -240,7 +240,7 @@ def measure(
         best=best,
         ln_evidence=best.ln_evidence,
         chi2=chi2,
-        degrees_of_freedom=fitted - problem.operator.amplitudes,
+        degrees_of_freedom=fitted - problem.operator.amplitudes - round(best.effective_parameters()),
         products=products,
         warnings=tuple(warnings),
     )

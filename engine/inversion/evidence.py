@@ -44,10 +44,18 @@ class Inversion:
         noise, _ = lapack.dtrtrs(self.factor, rng.standard_normal(self.source.size), lower=0)
         return np.asarray(self.source + noise.reshape(self.grid.shape))
 
-    def source_variance(self) -> FloatArray:
-        """Posterior variance (ny, nx) of the source pixels: the diagonal of A^-1."""
+    def source_covariance(self) -> FloatArray:
+        """Posterior covariance (ny nx, ny nx) of the source pixels: A^-1."""
         inverse, _ = lapack.dpotri(self.factor, lower=0)
-        return np.asarray(np.diag(inverse).reshape(self.grid.shape))
+        return np.asarray(np.triu(inverse) + np.triu(inverse, 1).T)
+
+    def source_variance(self) -> FloatArray:
+        """Posterior variance (ny, nx) of the source pixels."""
+        return np.asarray(np.diag(self.source_covariance()).reshape(self.grid.shape))
+
+    def effective_parameters(self) -> float:
+        """Number of source parameters that the data determine: tr(A^-1 F) (MacKay 1992)."""
+        return float((self.source_covariance() * self.curvature).sum())
 
 
 @kernel

@@ -54,6 +54,14 @@ def test_evidence_source_and_covariance_equal_the_dense_oracle(case: dict[str, o
             assert np.allclose(operator.fit_amplitudes(arc), solution[n:], rtol=1e-6, atol=1e-8)
 
 
+def test_the_effective_parameters_are_those_that_the_prior_does_not_decide() -> None:
+    scene, model = Case(amplitudes=2), SourceModel((8, 8))
+    inversion = invert(scene.operator(), LENS, 1.0, model)
+    _, _, covariance = scene.oracle(LENS, 1.0, model)
+    prior_share = math.e * np.trace(covariance[:64, :64] @ regularisation_matrix(model))
+    assert inversion.effective_parameters() == pytest.approx(64 - prior_share, rel=1e-8)
+
+
 def test_the_source_draws_have_the_posterior_mean_and_covariance() -> None:
     scene = Case(amplitudes=1)
     inversion = invert(scene.operator(), LENS, 1.0, SourceModel((6, 6)))
