@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import STAGES, Analysis, Host, Realization, RunResult, SpecError, generator, measure, run
+from engine import STAGES, Analysis, Host, Realization, RunResult, SpecError, generator, load_system, measure, run
 from engine.figures import run_figure
 from engine.simulation import Simulation
 
@@ -111,6 +111,17 @@ def test_the_truth_changes_nothing_but_the_biases(simulation: Simulation, realiz
     )
     assert [e.magnitude.mean for e in blind.estimates] == [e.magnitude.mean for e in told.estimates]
     assert np.array_equal(blind.products.chain, told.products.chain)
+
+
+def test_a_system_of_ones_own_without_deflector_light_and_with_shear(realization: Realization) -> None:
+    own = replace(load_system("HE0435"), deflector=None)
+    found = run(replace(realization, system=own, mass_model="epl_shear"))
+    names = [parameter.name for parameter in found.lens]
+    assert names == ["theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda"]
+    shear = next(parameter for parameter in found.lens if parameter.name == "gamma1")
+    # The catalogue's shear, found without having been told: within the coarse grid's model error.
+    assert shear.value.mean == pytest.approx(0.040, abs=0.03)
+    assert abs(found.estimate("projected", "free").magnitude.bias or 9.0) < 0.6
 
 
 def test_a_slope_without_a_mass_model_is_refused_by_field() -> None:

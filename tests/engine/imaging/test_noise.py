@@ -7,7 +7,7 @@ from engine.imaging.noise import draw_noise, exposure_variance
 from engine.spec import ExposurePlan
 
 F160W = load_camera("WFC3-IR_F160W")
-PLAN = ExposurePlan(dither="eight_point_quarter_pixel", long_s=599.0, n_long=2, short_s=43.98)
+PLAN = ExposurePlan(field_pixels=98, dither="eight_point_quarter_pixel", long_s=599.0, n_long=2, short_s=43.98)
 
 
 def test_author_level_is_the_formula_of_the_papers_script():
