@@ -16,7 +16,16 @@ from engine.errors import (
 from engine.grid import Grid, GridRun, expand, preset_names
 from engine.result import ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, generator, measure, run
-from engine.spec import Analysis, Camera, Host, LensSystem, Realization, realization_from_dict
+from engine.spec import (
+    Analysis,
+    Camera,
+    Host,
+    LensSystem,
+    NoiseLevel,
+    Realization,
+    realization_from_dict,
+    spec_error,
+)
 
 __all__ = [
     "STAGES",
@@ -33,6 +42,7 @@ __all__ = [
     "LensParameter",
     "LensSystem",
     "Measurement",
+    "NoiseLevel",
     "ObservationError",
     "PosteriorError",
     "Products",
@@ -53,6 +63,7 @@ __all__ = [
     "preset_names",
     "realization_from_dict",
     "run",
+    "spec_error",
     "system_facts",
     "system_names",
 ]

@@ -7,19 +7,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, create_model
 
-from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
-from engine.grid import Grid, expand, preset_names
-from engine.spec import Analysis, NoiseLevel
+from engine import (
+    Analysis,
+    Grid,
+    GridRun,
+    NoiseLevel,
+    camera_names,
+    engine_digest,
+    expand,
+    load_camera,
+    load_system,
+    preset_names,
+    system_facts,
+    system_names,
+)
 from service.schemas import CameraItem, EngineView, SystemItem, SystemView
 from service.store.grids import PlannedRun
-
-if TYPE_CHECKING:
-    from engine.grid import GridRun
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 _PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
@@ -178,6 +185,4 @@ def list_cameras() -> list[CameraItem]:
 
 def engine_view(version: str) -> EngineView:
     """Which engine runs here."""
-    # Loaded when first asked for: the digest covers the numeric libraries, which take seconds to import.
-    digest: str = import_module("engine").engine_digest()
-    return EngineView(digest=digest, version=version, presets=list(preset_names()))
+    return EngineView(digest=engine_digest(), version=version, presets=list(preset_names()))

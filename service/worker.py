@@ -17,7 +17,7 @@ from service.artefacts import ArtefactStore
 from service.payload import ArtefactPayload, result_payload
 
 if TYPE_CHECKING:
-    from engine.result import RunResult
+    from engine import RunResult
 
 _LOG = logging.getLogger(__name__)
 
@@ -52,17 +52,19 @@ def execute(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
         The engine returned a number that is not finite.
     """
     # Imported by the first run: the engine takes seconds to load, and only workers need it.
-    engine = import_module("engine")
-    result: RunResult = engine.run(engine.realization_from_dict(spec))
+    from engine import realization_from_dict, run
+
+    result = run(realization_from_dict(spec))
     artefacts = ArtefactStore(artefact_url)
     figure = artefacts.put(_figure(result), "png")
     return result_payload(result, figure, _products(result, artefacts)).model_dump(mode="json")
 
 
 def _figure(result: RunResult) -> bytes:
-    figure = import_module("engine.figures").run_figure(result)
+    from engine.figures import run_figure
+
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110)
+    run_figure(result).savefig(data, format="png", dpi=110)
     return data.getvalue()
 
 
@@ -70,12 +72,14 @@ def _products(result: RunResult, artefacts: ArtefactStore) -> ArtefactPayload | 
     """Every array and number of the products as NPZ, under the names that the engine gives them."""
     if result.products is None:
         return None
-    numpy = import_module("numpy")
+    import numpy
+
     values = {field.name: getattr(result.products, field.name) for field in dataclasses.fields(result.products)}
     arrays = {name: numpy.asarray(value) for name, value in values.items() if value is not None}
     data = io.BytesIO()
     # Objects would be pickled, and nobody should have to unpickle a file to read it.
-    numpy.savez_compressed(data, **{name: array for name, array in arrays.items() if array.dtype != object})
+    plain: dict[str, Any] = {name: array for name, array in arrays.items() if array.dtype != object}
+    numpy.savez_compressed(data, **plain)
     return artefacts.put(data.getvalue(), "npz")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ from astropy.io import fits
 from scipy import sparse
 
 from engine.errors import ObservationError
+from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
+from engine.imaging.response import PointResponse
 
 FORMAT_VERSION = 1
 
@@ -23,7 +26,7 @@ def write_observation(
     centre: tuple[float, float] | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write an Observation: extensions IMAGE, NOISE, PSF, VALID and, where there is one, COVARIANCE.
+    """Write an Observation: extensions IMAGE, NOISE, PSF, VALID and, where it has them, COVARIANCE and EXPOSURES.
 
     Parameters
     ----------
@@ -51,6 +54,8 @@ def write_observation(
         plane.header["BUNIT"] = "electron/s"
     if observation.covariance is not None:
         planes.append(_covariance_table(observation.covariance))
+    if observation.response is not None:
+        planes.append(_exposures(observation.response))
     fits.HDUList([primary, *planes]).writeto(path, overwrite=overwrite, checksum=True)
 
 
@@ -90,6 +95,29 @@ def _covariance_table(covariance: sparse.csr_matrix) -> fits.BinTableHDU:
         ],
         name="COVARIANCE",
     )
+
+
+def _exposures(response: PointResponse) -> fits.ImageHDU:
+    """The optical PSF on sub-pixels, with sampling and detector kernel as JSON text in its header."""
+    plane = fits.ImageHDU(response.psf, name="EXPOSURES")
+    plane.header["SAMPLING"] = json.dumps(asdict(response.geometry))
+    plane.header["DETECTOR"] = json.dumps(response.detector_kernel.tolist())
+    return plane
+
+
+def _response(plane: fits.ImageHDU) -> PointResponse:
+    values = json.loads(plane.header["SAMPLING"])
+    try:
+        # JSON has lists where the geometry has tuples, on which its hash depends.
+        tuples = {name: _tuples(value) for name, value in values.items()}
+        geometry = Geometry(**tuples)
+    except TypeError as error:
+        raise ObservationError(f"EXPOSURES: its sampling is not of this layout ({error})") from error
+    return PointResponse(plane.data.astype(np.float64), geometry, np.array(json.loads(plane.header["DETECTOR"])))
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(_tuples(entry) for entry in value) if isinstance(value, list) else value
 
 
 def read_observation(path: str | Path) -> Observation:
@@ -133,6 +161,7 @@ def _observation(hdus: fits.HDUList) -> Observation:
         covariance=covariance,
         valid=hdus["VALID"].data.astype(bool),
         provenance=provenance,
+        response=_response(hdus["EXPOSURES"]) if "EXPOSURES" in hdus else None,
     )
 
 

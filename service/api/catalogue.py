@@ -6,7 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path
 
-from engine.errors import SpecError
+from engine import SpecError
 from service import VERSION
 from service.requests import engine_view, list_cameras, list_systems, system_view
 from service.schemas import CameraList, EngineView, SystemList, SystemView

@@ -14,8 +14,7 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
-from engine.errors import SpecError
-from engine.spec import spec_error
+from engine import SpecError, spec_error
 from service.requests import TooManyRunsError
 from service.schemas import Place, Problem
 from service.store.grids import KeyReusedError, NotFoundError

@@ -4,6 +4,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from scipy import sparse
 
+from engine.catalogue import load_camera, load_dither
 from engine.errors import ObservationError
 from engine.imaging.fits import read_image, read_observation, write_observation
 from engine.imaging.observation import Observation, observation_from_arrays
@@ -135,3 +136,19 @@ def test_the_real_image_of_rxj1131_can_be_read(shared_data):
     assert observation.shape == (175, 175)
     assert observation.valid.mean() > 0.9
     assert observation.psf.sum() == pytest.approx(1, abs=1e-12)
+
+
+def test_the_exposures_behind_an_observation_are_kept(tmp_path):
+    from engine.imaging.geometry import exposure_geometry
+    from engine.imaging.response import PointResponse
+
+    geometry = exposure_geometry(load_camera("WFC3-IR_F160W"), load_dither("eight_point_quarter_pixel"), (12, 12))
+    grid = np.arange(21) - 10
+    psf = np.exp(-0.5 * np.add.outer(grid**2, grid**2) / 2.5**2)
+    kernel = np.array([[0.0, 0.02, 0.0], [0.02, 0.92, 0.02], [0.0, 0.02, 0.0]])
+    image = np.ones((12, 12))
+    whole = Observation(image, image, np.ones((3, 3)), 0.08, 25.9, response=PointResponse(psf, geometry, kernel))
+    write_observation(tmp_path / "o.fits", whole)
+    again = read_observation(tmp_path / "o.fits")
+    assert again.response.geometry == geometry
+    np.testing.assert_array_equal(again.point_source(0.03, -0.11), whole.point_source(0.03, -0.11))
