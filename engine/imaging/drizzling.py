@@ -3,6 +3,11 @@
 Drizzling is linear in the exposures (Fruchter & Hook 2002, eqs. 4 and 5): image = W exposures, with every row
 of W a weighted mean. W is taken from the package itself by drizzling impulses; with it the noise map is (W o
 W) v and the covariance W diag(v) W^T.
+
+With equal weights the droplets of F160W's dithers fall unevenly on the drizzled pixels (their ratio is 0.615), and a
+star gains or loses up to 0.3 % of its flux, depending on where it stands. The exposures therefore carry weight maps
+under which every native pixel hands on the same share of its light; they stay within 12 % of equal and cost 0.15 %
+in variance.
 """
 
 from __future__ import annotations
@@ -12,11 +17,16 @@ from functools import lru_cache
 
 import numpy as np
 from drizzle.resample import Drizzle
+from numpy.typing import NDArray
 from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
 from engine.imaging.geometry import Geometry
+
+_BALANCING_STEPS = 200
+_EVENNESS = 1e-4
+_SHARING_KERNELS = ("square", "turbo")
 
 
 def pixel_map(geometry: Geometry, index: int) -> FloatArray:
@@ -51,7 +61,7 @@ def drizzle(exposures: FloatArray, geometry: Geometry, weights: FloatArray | Non
     exposures
         (n_dither, ny, nx) flux per native pixel.
     weights
-        Weight maps of the same shape; equal weights where None.
+        Weight maps of the same shape; those of :func:`even_weights` where None.
 
     Returns
     -------
@@ -60,9 +70,10 @@ def drizzle(exposures: FloatArray, geometry: Geometry, weights: FloatArray | Non
     _check_exposures(exposures, geometry)
     if weights is not None and weights.shape != exposures.shape:
         raise ObservationError(f"drizzle weights: got shape {weights.shape}, allowed is {exposures.shape}")
+    maps = even_weights(geometry) if weights is None else weights
     total = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True)
     for index, exposure in enumerate(exposures):
-        _add(total, exposure, geometry, index, None if weights is None else weights[index])
+        _add(total, exposure, geometry, index, maps[index])
     return np.asarray(total.out_img, dtype=np.float64)
 
 
@@ -73,13 +84,56 @@ def _check_exposures(exposures: FloatArray, geometry: Geometry) -> None:
 
 
 @lru_cache(maxsize=16)
-def drizzle_weights(geometry: Geometry) -> sparse.csr_matrix:
-    """Return the matrix W of the drizzle with equal exposure weights: image = W @ exposures.ravel().
+def even_weights(geometry: Geometry) -> FloatArray:
+    """Weight maps (n_dither, ny, nx) under which each native pixel well inside the image keeps its flux.
 
-    Shape (n_drizzled, n_dither * n_native), rows and columns in row-major order. Found by drizzling combs of
-    impulses so far apart that their footprints cannot touch; for each exposure apart, then put together as
-    the package does, by the weights it reports. Exact to the package's single precision. Kept in memory; not
-    to be changed.
+    Found by balancing W in the manner of Sinkhorn: its rows are weighted means whatever the weights, and the weights
+    are divided by what their pixels gain until none gains more than 1e-4. The point and Gaussian kernels, which do not
+    share out a pixel's flux in the first place, keep equal weights. Read-only; kept in memory.
+    """
+    equal = _equal_weight_matrix(geometry)
+    inside = np.stack([_well_inside(geometry, index) for index in range(geometry.n_dither)])
+    weights = np.ones(inside.shape)
+    flat, chosen = weights.reshape(-1), inside.ravel()
+    rows = np.asarray(equal.sum(axis=1)).ravel()
+    transposed = equal.T.tocsr()
+    for _ in range(_BALANCING_STEPS if geometry.kernel in _SHARING_KERNELS else 0):
+        gain = geometry.n_dither * flat * (transposed @ (rows / (equal @ flat)))
+        if not chosen.any() or np.abs(gain[chosen] - 1.0).max() < _EVENNESS:
+            break
+        flat[chosen] /= gain[chosen]
+    weights.setflags(write=False)
+    return weights
+
+
+def _well_inside(geometry: Geometry, index: int) -> NDArray[np.bool_]:
+    """Native pixels of an exposure whose droplets fall on the drizzled image entirely."""
+    x, y = geometry.native_axes(index)
+    half_y, half_x = (0.5 * (n - 1) * geometry.drizzled_scale - geometry.pixel_scale for n in geometry.drizzled_shape)
+    return np.asarray((np.abs(y) < half_y)[:, None] & (np.abs(x) < half_x)[None, :])
+
+
+@lru_cache(maxsize=16)
+def drizzle_weights(geometry: Geometry) -> sparse.csr_matrix:
+    """Return the matrix W of the drizzle with even weights: image = W @ exposures.ravel().
+
+    Shape (n_drizzled, n_dither * n_native), rows and columns in row-major order. Exact to the package's single
+    precision. Kept in memory; not to be changed.
+    """
+    equal = _equal_weight_matrix(geometry)
+    weighted = equal @ sparse.diags(even_weights(geometry).ravel(), format="csr")
+    scale = np.asarray(equal.sum(axis=1)).ravel() / np.asarray(weighted.sum(axis=1)).ravel()
+    matrix = (sparse.diags(scale, format="csr") @ weighted).tocsr()
+    matrix.data.setflags(write=False)
+    return matrix
+
+
+@lru_cache(maxsize=16)
+def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
+    """W with equal weights.
+
+    Found by drizzling combs of impulses so far apart that their footprints cannot touch; for each exposure apart,
+    then put together as the package does, by the weights it reports.
     """
     step = _comb_step(geometry)
     weight_sum = np.zeros(geometry.drizzled_shape)

@@ -10,9 +10,8 @@ from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covarian
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import resized
 
-# The drizzle is a weighted mean, so a star gains or loses where the droplets lie unevenly: up to this much,
-# measured over 200 positions. The 0.615 ratio of F160W has uneven weights; the other two have even ones.
-STAR_FLUX = {"F160W": 4e-3, "F160W-sixth": 3e-3, "UVIS": 1e-6, "ACS": 1e-6}
+# Even weights leave a native pixel 1e-4 of its flux; equal ones leave a star of F160W up to 2.9e-3.
+STAR_FLUX = 1e-4
 
 
 def star(setup, position, geometry=None):
@@ -27,32 +26,31 @@ def test_uniform_sky_keeps_its_surface_brightness(setup):
 
 
 def test_flux_is_conserved_on_average_over_the_field(setup):
-    # The mean gain over all places of a source: asked for is 1e-4, single precision gives 2e-8.
+    # The mean gain over all places of a source: asked for is 1e-4 of each pixel, and the weights are balanced to that.
     gain = np.asarray(drizzle_weights(setup.geometry).sum(axis=0))
     gain = gain.reshape(-1, *setup.geometry.native_shape).sum(axis=0)
     period = 32  # native pixels: whole beats of drizzled and native pixels for each of the cameras
-    assert gain[8 : 8 + period, 8 : 8 + period].mean() == pytest.approx(1, abs=1e-6)
+    assert gain[8 : 8 + period, 8 : 8 + period].mean() == pytest.approx(1, abs=3e-5)
 
 
 def test_flux_of_an_einstein_ring_is_conserved(setup):
-    # Asked for is 1e-3; measured 3.5e-4 for F160W, below 1e-5 for the others.
+    # Asked for is 1e-3.
     geometry = setup.geometry
     radius = 0.2 * min(geometry.drizzled_shape) * geometry.drizzled_scale
     x, y = geometry.high_resolution_axes()
     ring = np.exp(-((np.hypot(x, y[:, None]) - radius) ** 2) / (2 * 0.08**2))
     light = convolve(ring / ring.sum(), setup.psf)
     image = drizzle(expose(light, geometry, setup.kernel), geometry)
-    assert image.sum() == pytest.approx(setup.psf.sum(), rel=5e-4)
+    assert image.sum() == pytest.approx(setup.psf.sum(), rel=1e-4)
 
 
-def test_star_flux_is_conserved_as_well_as_the_weights_are_even(setup, request):
-    name = request.node.callspec.params["setup"]
+def test_the_flux_of_a_star_is_conserved_wherever_it_stands(setup):
     rng = np.random.default_rng(3)
     gain = np.asarray(drizzle_weights(setup.geometry).sum(axis=0)).ravel()
     for position in rng.uniform(-0.3, 0.3, (4, 2)):
         exposures = star(setup, position)
         flux = drizzle(exposures, setup.geometry).sum()
-        assert flux == pytest.approx(setup.psf.sum(), rel=STAR_FLUX[name])
+        assert flux == pytest.approx(setup.psf.sum(), rel=STAR_FLUX)
         # All of the difference is the weights' doing.
         assert flux == pytest.approx(gain @ exposures.ravel(), rel=1e-6)
 
