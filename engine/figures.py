@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import AsinhNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from engine.conventions import FloatArray
 from engine.result import Products, RunResult
@@ -52,7 +53,7 @@ def run_figure(result: RunResult) -> Figure:
     products = result.products
     if products is None:
         raise ValueError("products: got None, allowed is a result with its arrays")
-    figure = Figure(figsize=(12.5, 7.6), layout="constrained")
+    figure = Figure(figsize=(12.5, 7.6), layout=ConstrainedLayoutEngine(w_pad=0.15, h_pad=0.08))
     axes = figure.subplots(2, 3)
     extent = _image_extent(products)
     inside = np.where(products.mask, products.model, np.nan)
@@ -79,7 +80,7 @@ def run_figure(result: RunResult) -> Figure:
     figure.suptitle(
         f"run {result.realization_digest[:12]}   chi$^2$/dof {result.chi2 / result.degrees_of_freedom:.2f}   "
         f"host {free.magnitude.mean:.2f} +- {free.magnitude.sd:.2f} mag (paper estimator)   "
-        f"chain {result.chain.status}",
+        f"chain {result.chain.status.replace('_', ' ')}",
         fontsize=10,
     )
     return figure
