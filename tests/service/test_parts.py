@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,9 @@ from matplotlib.figure import Figure
 from pydantic import ValidationError
 from typer.testing import CliRunner
 
+import engine.figures
 from engine.result import ChainSummary, Estimate, LensParameter, Quantity, RunResult, StageTime
-from engine.spec import Analysis, realization_from_dict
+from engine.spec import Analysis
 from service.api.app import create_app
 from service.artefacts import ArtefactStore
 from service.cli import app
@@ -191,13 +191,10 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     values = {"image": flat, "model": flat, "source_truth": None, "names": ("a", "b")}
     products = dataclasses.make_dataclass("Products", list(values))(**values)
     digest = planned(1)[0].digest
-    engine = SimpleNamespace(
-        realization_from_dict=realization_from_dict,
-        run=lambda realization: engine_result(realization_digest=realization.digest, products=products),
+    monkeypatch.setattr(
+        engine, "run", lambda realization: engine_result(realization_digest=realization.digest, products=products)
     )
-    figures = SimpleNamespace(run_figure=lambda _: Figure())
-    modules = {"engine": engine, "engine.figures": figures, "numpy": np}
-    monkeypatch.setattr("service.worker.import_module", modules.__getitem__)
+    monkeypatch.setattr(engine.figures, "run_figure", lambda _: Figure())
     payload = read_payload(execute(SPEC, str(tmp_path)))
     assert payload.realization_digest == digest
     store = ArtefactStore(str(tmp_path))
