@@ -18,13 +18,13 @@ from engine.imaging.drizzled_psf import DrizzledPsf, drizzled_psf
 from engine.imaging.drizzling import drizzle, drizzled_covariance
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
-from engine.imaging.noise import ExposureNoise, draw_noise, exposure_variance
+from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.imaging.response import PointResponse
 from engine.light.rendering import render_sersic
 from engine.scene import Scene
-from engine.spec import Camera, NoiseLevel
+from engine.spec import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
 
 _PSF_REACH = 5.0
 """Half-width [arcsec] of the drizzled PSF stamp at most; beyond it lies less than 2 % of a star."""
@@ -60,12 +60,9 @@ def scene_geometry(scene: Scene) -> Geometry:
     return exposure_geometry(scene.camera, load_dither(plan.dither), (plan.field_pixels, plan.field_pixels))
 
 
-@lru_cache(maxsize=8)
-def optical_psf(camera: Camera, oversampling: int) -> FloatArray:
+def optical_psf(camera: Camera, oversampling: int, optics: Optics = NOMINAL_OPTICS) -> FloatArray:
     """PSF of a camera on sub-pixels, computed once per process."""
-    psf = telescope_psf(camera, oversampling=oversampling)
-    psf.setflags(write=False)
-    return psf
+    return telescope_psf(camera, oversampling=oversampling, defocus_nm=optics.defocus_nm, jitter=optics.jitter)
 
 
 @lru_cache(maxsize=8)
@@ -85,7 +82,7 @@ def high_resolution_host(scene: Scene, geometry: Geometry) -> FloatArray:
 
 def high_resolution_image(scene: Scene, geometry: Geometry, host: FloatArray) -> FloatArray:
     """Host, deflector and AGN after the PSF, on the high-resolution grid; what the scene lacks is not computed."""
-    psf = optical_psf(scene.camera, geometry.oversampling)
+    psf = optical_psf(scene.camera, geometry.oversampling, scene.optics)
     extended = host
     if scene.deflector is not None:
         x, y = geometry.high_resolution_axes()
@@ -103,12 +100,12 @@ def simulate_exposures(
 ) -> Exposures:
     """Dithered exposures of a high-resolution image, with noise drawn from ``rng``."""
     noiseless = expose(image, geometry, detector_kernel(scene.camera))
-    noise = exposure_variance(noiseless, scene.camera, scene.system.exposures, noise_level)
-    return Exposures(noiseless, noiseless + draw_noise(noise.variance, rng), noise, geometry)
+    noise = exposure_noise(noiseless, scene.camera, scene.system.exposures, noise_level)
+    return Exposures(noiseless, noiseless + draw_noise(noise, rng), noise, geometry)
 
 
 def combine(scene: Scene, exposures: Exposures) -> Observation:
-    """Drizzle exposures into an observation with noise map, covariance and PSF."""
+    """Drizzle exposures into an observation with noise map, covariance and the camera's nominal PSF."""
     geometry = exposures.geometry
     covariance = drizzled_covariance(exposures.noise.variance, geometry)
     return Observation(
@@ -125,6 +122,8 @@ def combine(scene: Scene, exposures: Exposures) -> Observation:
             "DITHER": scene.system.exposures.dither,
             "PIXFRAC": geometry.pixfrac,
             "KERNEL": geometry.kernel,
+            "DEFOCUS": scene.optics.defocus_nm,
+            "JITTER": scene.optics.jitter,
         },
         response=PointResponse(
             optical_psf(scene.camera, geometry.oversampling), geometry, detector_kernel(scene.camera)
@@ -138,9 +137,8 @@ def simulate(scene: Scene, noise_level: NoiseLevel, rng: np.random.Generator) ->
     host = high_resolution_host(scene, geometry)
     image = high_resolution_image(scene, geometry, host)
     exposures = simulate_exposures(scene, geometry, image, noise_level, rng)
-    arc_exposures = expose(
-        convolve(host, optical_psf(scene.camera, geometry.oversampling)), geometry, detector_kernel(scene.camera)
-    )
+    psf = optical_psf(scene.camera, geometry.oversampling, scene.optics)
+    arc_exposures = expose(convolve(host, psf), geometry, detector_kernel(scene.camera))
     return Simulation(
         observation=combine(scene, exposures),
         exposures=exposures,
