@@ -15,7 +15,7 @@ from engine.catalogue import load_dither
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.imaging.blurring import convolve, point_source_image
 from engine.imaging.drizzled_psf import DrizzledPsf, drizzled_psf
-from engine.imaging.drizzling import drizzle, drizzled_covariance
+from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
@@ -108,6 +108,8 @@ def combine(scene: Scene, exposures: Exposures) -> Observation:
     """Drizzle exposures into an observation with noise map, covariance and the camera's nominal PSF."""
     geometry = exposures.geometry
     covariance = drizzled_covariance(exposures.noise.variance, geometry)
+    # A saturated native pixel spoils every drizzled pixel that it has a share in.
+    spoilt = drizzle_weights(geometry) @ exposures.noise.saturated.ravel()
     return Observation(
         image=drizzle(exposures.noisy, geometry),
         noise=np.sqrt(covariance.diagonal()).reshape(geometry.drizzled_shape),
@@ -115,6 +117,7 @@ def combine(scene: Scene, exposures: Exposures) -> Observation:
         pixel_scale=geometry.drizzled_scale,
         zero_point=scene.camera.zero_point,
         covariance=covariance,
+        valid=(spoilt == 0).reshape(geometry.drizzled_shape),
         provenance={
             "SYSTEM": scene.system.name,
             "CAMERA": scene.camera.name,
