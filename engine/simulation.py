@@ -14,6 +14,7 @@ import numpy as np
 from engine.catalogue import load_dither
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.imaging.blurring import convolve, point_source_image
+from engine.imaging.cusps import place_cusps
 from engine.imaging.drizzled_psf import DrizzledPsf, drizzled_psf
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
 from engine.imaging.exposures import expose
@@ -22,6 +23,7 @@ from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.imaging.response import PointResponse
+from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
 from engine.scene import Scene
 from engine.spec import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
@@ -80,14 +82,22 @@ def high_resolution_host(scene: Scene, geometry: Geometry) -> FloatArray:
     return render_sersic(scene.host, x, y, geometry.subpixel_scale, scene.lens)
 
 
-def high_resolution_image(scene: Scene, geometry: Geometry, host: FloatArray) -> FloatArray:
-    """Host, deflector and AGN after the PSF, on the high-resolution grid; what the scene lacks is not computed."""
+def blurred_host(scene: Scene, geometry: Geometry, host: FloatArray) -> FloatArray:
+    """The lensed host after the PSF, on the high-resolution grid."""
+    images = solve_lens_equation(scene.lens, scene.host.x, scene.host.y)
+    placed = place_cusps(host, scene.host, [(image.x, image.y) for image in images], geometry, scene.lens)
+    return convolve(placed, optical_psf(scene.camera, geometry.oversampling, scene.optics))
+
+
+def high_resolution_image(scene: Scene, geometry: Geometry, arc: FloatArray) -> FloatArray:
+    """Blurred host (``arc``), deflector and AGN on the high-resolution grid; what the scene lacks is not computed."""
     psf = optical_psf(scene.camera, geometry.oversampling, scene.optics)
-    extended = host
+    image = arc
     if scene.deflector is not None:
         x, y = geometry.high_resolution_axes()
-        extended = extended + render_sersic(scene.deflector, x, y, geometry.subpixel_scale)
-    image = convolve(extended, psf)
+        light = render_sersic(scene.deflector, x, y, geometry.subpixel_scale)
+        cusp = (scene.deflector.x, scene.deflector.y)
+        image = image + convolve(place_cusps(light, scene.deflector, [cusp], geometry), psf)
     if scene.agn:
         positions = np.array([(source.x, source.y) for source in scene.agn])
         fluxes = np.array([source.flux for source in scene.agn])
@@ -138,13 +148,12 @@ def simulate(scene: Scene, noise_level: NoiseLevel, rng: np.random.Generator) ->
     """The whole forward simulation of a scene."""
     geometry = scene_geometry(scene)
     host = high_resolution_host(scene, geometry)
-    image = high_resolution_image(scene, geometry, host)
+    arc = blurred_host(scene, geometry, host)
+    image = high_resolution_image(scene, geometry, arc)
     exposures = simulate_exposures(scene, geometry, image, noise_level, rng)
-    psf = optical_psf(scene.camera, geometry.oversampling, scene.optics)
-    arc_exposures = expose(convolve(host, psf), geometry, detector_kernel(scene.camera))
     return Simulation(
         observation=combine(scene, exposures),
         exposures=exposures,
-        arc=drizzle(arc_exposures, geometry),
+        arc=drizzle(expose(arc, geometry, detector_kernel(scene.camera)), geometry),
         arc_magnitude=rate_to_magnitude(float(host.sum()), scene.camera.zero_point),
     )
