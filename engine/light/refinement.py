@@ -36,6 +36,9 @@ _G3 = math.sqrt(0.6)
 _G2 = 1.0 / math.sqrt(3.0)
 _W3_CENTRE, _W3_SIDE = 4.0 / 9.0, 5.0 / 18.0
 
+_BATCH = 1024
+"""Cells integrated together: their rays stay in the cache."""
+
 # Nodes of the 3 x 3 rule row by row, then of the 2 x 2 rule, in units of half a side.
 _NODE_X = np.array([-_G3, 0.0, _G3] * 3 + [-_G2, _G2] * 2)
 _NODE_Y = np.array([-_G3] * 3 + [0.0] * 3 + [_G3] * 3 + [-_G2] * 2 + [_G2] * 2)
@@ -50,9 +53,9 @@ class _Cells:
     y: FloatArray
     owner: NDArray[np.int64]
 
-    def nodes(self, half: float) -> tuple[FloatArray, FloatArray]:
-        """Positions (13 n,) of the nodes of both rules."""
-        return np.add.outer(self.x, half * _NODE_X).ravel(), np.add.outer(self.y, half * _NODE_Y).ravel()
+    def nodes(self, part: slice, half: float) -> tuple[FloatArray, FloatArray]:
+        """Positions (13 n,) of the nodes of both rules for n of the cells."""
+        return np.add.outer(self.x[part], half * _NODE_X).ravel(), np.add.outer(self.y[part], half * _NODE_Y).ravel()
 
     def split(self, chosen: NDArray[np.bool_], half: float) -> _Cells:
         """The four quarters of each chosen cell."""
@@ -105,6 +108,19 @@ def _integrate(
         error[i] = min(abs(three - two), most - least) * area if smooth[i] else (most - least) * area
 
 
+def _judge(
+    cells: _Cells, half: float, trace: Tracer, table: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Flux, certain flux, error and smoothness of the cells of a level, a batch at a time."""
+    n = cells.x.size
+    flux, certain, error, smooth = np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+    for start in range(0, n, _BATCH):
+        part = slice(start, start + _BATCH)
+        u, v = trace(*cells.nodes(part, half))
+        _integrate(u, v, (2.0 * half) ** 2, _WEIGHTS, table, flux[part], certain[part], error[part], smooth[part])
+    return flux, certain, error, smooth
+
+
 def refine_pixels(
     x: FloatArray,
     y: FloatArray,
@@ -115,18 +131,16 @@ def refine_pixels(
     absolute: float = 0.0,
     relative: float = 0.0,
 ) -> FloatArray:
-    """Flux (n,) [e-/s] of pixels with centres ``x``, ``y`` (n,) [arcsec].
+    """Flux (n,) of pixels with centres ``x``, ``y`` (n,) and given side [arcsec].
 
-    The estimated error of each pixel is at most ``absolute`` [e-/s], or ``relative`` times the brightest of these
-    pixels where that is more; ``trace`` and ``table`` are the profile's.
+    The estimated error of each pixel is at most ``absolute``, or ``relative`` times the brightest of these pixels
+    where that is more; ``trace`` and ``table`` are the profile's.
     """
     total = np.zeros(x.size)
     cells = _Cells(x, y, np.arange(x.size))
     for depth in range(MAX_DEPTH + 1):
         half = side * 0.5 ** (depth + 1)
-        n = cells.x.size
-        flux, certain, error, smooth = np.empty(n), np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
-        _integrate(*trace(*cells.nodes(half)), (2.0 * half) ** 2, _WEIGHTS, table, flux, certain, error, smooth)
+        flux, certain, error, smooth = _judge(cells, half, trace, table)
         brightest = (total + np.bincount(cells.owner, weights=certain, minlength=x.size)).max()
         limit = max(absolute, relative * brightest)
         # Smooth cells lie along an arc or round the cusp, twice as many at each level: each may have its share only.

@@ -27,6 +27,9 @@ from engine.light.sersic import kernel_arguments as sersic_arguments
 DEFAULT_TOLERANCE = 1e-4
 """Estimated error of a pixel as a fraction of the brightest, and of all pixels together as a fraction of the flux."""
 
+MIN_TOLERANCE = 1e-8
+"""The radial table is good to 1e-7 at worst, mostly better; what is asked beyond that is not had."""
+
 _CANDIDATES = 8
 """Pixels that are refined first, to learn how bright the brightest is."""
 
@@ -97,12 +100,13 @@ def _average(
 
 @kernel
 def _greatest_of_neighbours(error: FloatArray) -> FloatArray:
+    """For each pixel the greatest error of the 3 x 3 about it: a single difference may vanish by accident."""
     out = error.copy()
     rows, columns = error.shape
     for j in range(rows):
         for i in range(columns):
-            for k in range(max(j-1,0), min(j + 2, rows)):
-                for m in range(max(i-1,0), min(i + 2, columns)):
+            for k in range(max(j - 1, 0), min(j + 2, rows)):
+                for m in range(max(i - 1, 0), min(i + 2, columns)):
                     out[j, i] = max(out[j, i], error[k, m])
     return out
 
@@ -117,12 +121,24 @@ def _sum_below(error: FloatArray, limit: float) -> float:
 
 
 def _axis_with_halo(centres: FloatArray, side: float, name: str) -> FloatArray:
-    centres = np.asarray(centres, dtype=np.float64)
     step = math.copysign(side, centres[-1] - centres[0])
     if not np.allclose(np.diff(centres), step, rtol=0.0, atol=1e-6 * side):
         raise SpecError(name, centres, f"centres that are pixel_scale = {side} apart")
     beyond = step * np.arange(1, _HALO + 1)
     return np.concatenate([centres[0] - beyond[::-1], centres, centres[-1] + beyond])
+
+
+def _first_pass(
+    x: FloatArray, y: FloatArray, side: float, trace: Tracer, table: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Flux of each pixel from one ray a pixel, and an estimate of its error; both (ny, nx), for unit flux."""
+    columns, rows = _axis_with_halo(x, side, "x"), _axis_with_halo(y, side, "y")
+    shape = (rows.size, columns.size)
+    u, v = trace(np.tile(columns, rows.size), np.repeat(rows, columns.size))
+    f = brightness(u, v, table)
+    mean, error = np.empty((y.size, x.size)), np.empty((y.size, x.size))
+    _average(u.reshape(shape), v.reshape(shape), f.reshape(shape), table, mean, error)
+    return mean * side**2, np.asarray(_greatest_of_neighbours(error)) * side**2
 
 
 def render_sersic(
@@ -156,28 +172,21 @@ def render_sersic(
     Raises
     ------
     SpecError
-        Where the pixels are not ``pixel_scale`` apart.
+        Where the pixels are not ``pixel_scale`` apart, or the tolerance is below what the radial table can give.
     """
+    if not MIN_TOLERANCE <= tolerance < 1:
+        raise SpecError("tolerance", tolerance, f"at least {MIN_TOLERANCE} and below 1")
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     trace, table = _tracer(profile, lens), tabulate(profile)
-    columns, rows = _axis_with_halo(x, pixel_scale, "x"), _axis_with_halo(y, pixel_scale, "y")
-    shape = (rows.size, columns.size)
-    u, v = trace(np.tile(columns, rows.size), np.repeat(rows, columns.size))
-    f = brightness(u, v, table)
-    image, error = np.empty((len(y), len(x))), np.empty((len(y), len(x)))
-    _average(u.reshape(shape), v.reshape(shape), f.reshape(shape), table, image, error)
-    error = np.asarray(_greatest_of_neighbours(error))
-    area = pixel_scale**2
-    image *= area
-    error *= area
-
+    image, error = _first_pass(x, y, pixel_scale, trace, table)
 
     def refine(chosen: NDArray[np.intp], absolute: float, relative: float) -> None:
         j, i = np.unravel_index(chosen, image.shape)
         image[j, i] = refine_pixels(x[i], y[j], pixel_scale, trace, table, absolute=absolute, relative=relative)
         error[j, i] = 0.0
 
-    candidates = min(_CANDIDATES, image.size)
     # The brightest pixel is the measure of all errors, but a ray that meets the cusp makes its pixel too bright by far.
+    candidates = min(_CANDIDATES, image.size)
     refine(np.argpartition((image + error).ravel(), -candidates)[-candidates:], 0.0, tolerance)
     certain = np.maximum(image - error, 0.0)
     allowed = tolerance * float(certain.sum())
@@ -187,7 +196,7 @@ def render_sersic(
     chosen = np.flatnonzero(error > limit)
     if chosen.size:
         refine(chosen, min(limit, allowed / chosen.size), 0.0)
-    return image
+    return image * profile.flux
 
 
 def sample_lensed_sersic(
@@ -201,4 +210,4 @@ def sample_lensed_sersic(
     columns, rows = np.add.outer(x, offsets).ravel(), np.add.outer(y, offsets).ravel()
     u, v = _tracer(profile, lens)(np.tile(columns, rows.size), np.repeat(rows, columns.size))
     rays = brightness(u, v, tabulate(profile)).reshape(len(y), subrays, len(x), subrays)
-    return np.asarray(rays.mean(axis=(1, 3)) * pixel_scale**2)
+    return np.asarray(rays.mean(axis=(1, 3)) * (profile.flux * pixel_scale**2))

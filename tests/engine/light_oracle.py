@@ -56,18 +56,21 @@ def graded_fluxes(
     x: np.ndarray,
     y: np.ndarray,
     h: float,
-    lens: PowerLawLens,
+    lens: PowerLawLens | None = None,
     cusps: np.ndarray | None = None,
     reach: float = 4.0,
-    order: int = 10,
+    order: int = 14,
 ) -> np.ndarray:
-    """Lensed pixel fluxes by Gauss-Legendre on cells no larger than their distance from a cusp / ``reach``.
+    """Pixel fluxes by Gauss-Legendre on cells no larger than their distance from a cusp / ``reach``.
 
     ``cusps`` (n, 2) are the image positions of the profile's centre, by default all that the lens equation has.
     """
-    if cusps is None:
-        cusps = np.array([(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)])
-    singular = np.vstack([cusps, [[lens.x, lens.y]]])
+    if lens is None:
+        singular = np.array([[profile.x, profile.y]])
+    else:
+        if cusps is None:
+            cusps = np.array([(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)])
+        singular = np.vstack([cusps, [[lens.x, lens.y]]])
     nodes, weights = np.polynomial.legendre.leggauss(order)
     nx, ny = (0.5 * g.ravel() for g in np.meshgrid(nodes, nodes))
     nw = 0.25 * np.outer(weights, weights).ravel()
@@ -76,12 +79,12 @@ def graded_fluxes(
     out = np.zeros(cx.size)
     for depth in range(36):
         side = h * 0.5**depth
-        distance = np.min(
-            [np.maximum(np.abs(cx - sx), np.abs(cy - sy)) for sx, sy in singular], axis=0, initial=np.inf
-        )
+        distance = np.min([np.maximum(np.abs(cx - sx), np.abs(cy - sy)) for sx, sy in singular], axis=0, initial=np.inf)
         near = (distance < (reach + 0.5) * side) & (depth < 35)
         for part in np.array_split(np.flatnonzero(~near), 1 + cx.size // 4000):
-            bx, by = source_position(lens, np.add.outer(cx[part], side * nx), np.add.outer(cy[part], side * ny))
+            bx, by = np.add.outer(cx[part], side * nx), np.add.outer(cy[part], side * ny)
+            if lens is not None:
+                bx, by = source_position(lens, bx, by)
             flux = surface_brightness(profile, bx, by) @ nw * side**2
             out += np.bincount(owner[part], weights=flux, minlength=out.size)
         quarter = 0.25 * side
