@@ -30,9 +30,6 @@ DEFAULT_TOLERANCE = 1e-4
 MIN_TOLERANCE = 1e-8
 """The radial table is good to 1e-7 at worst, mostly better; what is asked beyond that is not had."""
 
-_CANDIDATES = 8
-"""Pixels that are refined first, to learn how bright the brightest is."""
-
 _CLEARANCE = 2.0
 """Distance of a pixel from the cusp in units of its size from which it may be trusted: the differences reach so far."""
 
@@ -185,12 +182,15 @@ def render_sersic(
         image[j, i] = refine_pixels(x[i], y[j], pixel_scale, trace, table, absolute=absolute, relative=relative)
         error[j, i] = 0.0
 
-    # The brightest pixel is the measure of all errors, but a ray that meets the cusp makes its pixel too bright by far.
-    candidates = min(_CANDIDATES, image.size)
-    refine(np.argpartition((image + error).ravel(), -candidates)[-candidates:], 0.0, tolerance)
-    certain = np.maximum(image - error, 0.0)
-    allowed = tolerance * float(certain.sum())
-    limit = tolerance * float(certain.max())
+    # The brightest pixel is the measure of all errors: first of all those that might be it, until one has proved to be.
+    while True:
+        certain, possible = image - error, image + error
+        limit = tolerance * max(float(certain.max()), 0.0)
+        rivals = np.flatnonzero((possible > 0.5 * possible.max()) & (error > limit))
+        if not rivals.size:
+            break
+        refine(rivals, limit, tolerance)
+    allowed = tolerance * float(np.maximum(certain, 0.0).sum())
     while _sum_below(error, limit) > allowed:
         limit *= 0.5
     chosen = np.flatnonzero(error > limit)

@@ -110,19 +110,18 @@ def test_the_radial_table_takes_any_radius() -> None:
     assert np.all(values[2:] < 1e-40 * values[0])
 
 
-def test_the_mean_of_a_smooth_pixel_is_that_of_its_polynomial() -> None:
-    # Quadratic brightness: mean over the unit pixel is the value plus a twenty-fourth of each second derivative; the
-    # fourth-order weights are checked by integrating quartics below.
-    x = np.arange(-4.0, 5.0)
-    px, py = np.meshgrid(x, x)
-    for powers, mean in (((4, 0), 1 / 80), ((0, 4), 1 / 80), ((2, 2), 1 / 144), ((2, 0), 1 / 12), ((1, 1), 0.0)):
-        f = 50.0 + px ** powers[0] * py ** powers[1] * 1e-3
-        # Rays that all meet the profile far out: its bounds, from a table as flat as f, leave the mean alone.
-        flat = np.array([[1e3, 0.0, 0.0, 0.0]] * len(tabulate(SersicProfile(1.0, 1.0, 1.0, 1.0, 0.0))))
-        flat[-(31 * 32) :] = 0.0
-        means, errors = np.empty((5, 5)), np.empty((5, 5))
-        rendering._average(px * 1e-3 + 1.0, py * 1e-3, f, flat, means, errors)
-        assert means[2, 2] == pytest.approx(50.0 + mean * 1e-3, abs=1e-12)
+@pytest.mark.parametrize("powers", [(0, 0), (1, 1), (2, 0), (0, 2), (2, 2), (4, 0), (0, 4), (5, 0), (3, 2)], ids=str)
+def test_the_mean_over_a_pixel_is_exact_for_quintics(powers: tuple[int, int]) -> None:
+    def mean(power: int, centre: float) -> float:
+        return ((centre + 0.5) ** (power + 1) - (centre - 0.5) ** (power + 1)) / (power + 1)
+
+    px, py = np.meshgrid(np.arange(-2.0, 3.0), np.arange(-2.0, 3.0))
+    f = 100.0 + (px + 0.3) ** powers[0] * (py - 0.2) ** powers[1]
+    # A profile that is bright at the pixel's centre and dark a pixel away, so that its bounds leave the mean alone.
+    table = tabulate(SersicProfile(1.0, 1e-3, 1.0, 1.0, 0.0))
+    means, errors = np.empty((1, 1)), np.empty((1, 1))
+    rendering._average(1e3 * px, 1e3 * py, f, table, means, errors)
+    assert means[0, 0] == pytest.approx(100.0 + mean(powers[0], 0.3) * mean(powers[1], -0.2), abs=1e-12)
 
 
 def test_errors_spread_to_neighbours_and_sum_below_a_limit() -> None:
@@ -206,7 +205,7 @@ def test_a_profile_of_a_tenth_of_a_pixel_keeps_its_flux(n: float) -> None:
 def test_a_deflector_on_a_large_field() -> None:
     # RXJ1131's sampling: 0.0125 arcsec, a deflector as wide as the field.
     profile = SersicProfile(100.0, 3.185, 4.59, 0.783, 0.496, 0.0013, -0.004)
-    x = (np.arange(160) - 79.5) * 0.0125
+    x = (np.arange(60) - 29.5) * 0.0125
     assert_as_promised(render_sersic(profile, x, x, 0.0125), flux_through_the_sides(profile, x, x, 0.0125))
 
 
@@ -243,18 +242,19 @@ def test_a_lensed_host_is_integrated_to_the_tolerance(scene: str, n: float, r_ef
 
 
 @pytest.mark.parametrize("where", ["fold", "cusp"])
-@pytest.mark.parametrize(("n", "subpixels"), [(0.5, 250), (1.0, 250), (4.0, 1500)])
+@pytest.mark.parametrize(("n", "subpixels"), [(0.5, 250), (1.0, 250), (4.0, 1000)])
 def test_a_host_on_the_caustic(n: float, subpixels: int, where: str) -> None:
-    # Two or three images merge on the critical curve, where no mesh graded in the image is good: there by brute force.
+    # Two or three images merge on the critical curve, where no mesh graded in the image is good: there by brute force,
+    # which 1000 points leave 4e-5 of the peak for n = 4.
     point, source = fold(HE0435, 1.29 + (0.6 if where == "fold" else 0.0))
     profile = SersicProfile(10.0, 0.39, n, 0.7, 0.3, *source)
     ours = render_sersic(profile, GRID, GRID, 0.08, HE0435)
+    others = [image for image in solve_lens_equation(HE0435, *source) if abs(image.magnification) < 1e4]
+    cusps = np.array([point, *((image.x, image.y) for image in others)])
+    reference = graded_fluxes(profile, GRID, GRID, 0.08, HE0435, cusps, reach=6.0, order=24 if n == 4 else 14)
     i, j = int(np.abs(GRID - point[0]).argmin()), int(np.abs(GRID - point[1]).argmin())
-    block = np.s_[j - 1 : j + 2, i - 1 : i + 2]
-    brute = supersampled(profile, GRID[i - 1 : i + 2], GRID[j - 1 : j + 2], 0.08, subpixels, HE0435)
-    reference = graded_fluxes(profile, GRID, GRID, 0.08, HE0435, np.array([point]), reach=6.0)
-    # Elsewhere the oracle is good again, and nothing but the block may differ from it.
-    reference[block] = brute
+    block = np.s_[j - 2 : j + 3, i - 5 : i + 6]
+    reference[block] = supersampled(profile, GRID[block[1]], GRID[block[0]], 0.08, subpixels, HE0435)
     assert_as_promised(ours, reference)
 
 
@@ -267,9 +267,9 @@ def test_the_host_of_sdss1206_reaches_over_its_caustic(n: float, r_eff: float) -
 
 
 def test_the_flux_of_a_small_source_is_magnified_as_the_lens_equation_says() -> None:
-    # r_eff of a fiftieth of a pixel: the magnification changes by 1e-5 across it.
+    # r_eff of a five-hundredth of a pixel: the magnification changes by 1e-5 across it.
     for centre in ((0.03, 0.02), (0.5, 0.2)):
-        profile = SersicProfile(2.0, 0.001, 0.5, 0.8, 0.3, *centre)
+        profile = SersicProfile(2.0, 0.0002, 0.5, 0.8, 0.3, *centre)
         total = render_sersic(profile, GRID * 1.25, GRID * 1.25, 0.1, HE0435).sum()
         images = solve_lens_equation(HE0435, *centre)
         assert total == pytest.approx(2.0 * sum(abs(image.magnification) for image in images), rel=DEFAULT_TOLERANCE)
@@ -319,10 +319,9 @@ def test_work_goes_where_the_brightness_varies(monkeypatch: pytest.MonkeyPatch) 
         render_sersic(SersicProfile(1.0, r_eff, n, 0.7, 0.3, 0.03, 0.05), x, x, 0.02, HE0435)
         return sum(rays)
 
-    # A smooth host takes little more than its one ray a pixel; a cusp more, but not the 3 x 3 of all pixels thrice.
-    assert rays == []
-    assert cost(0.5, 0.39) < 2 * x.size**2
-    assert cost(0.5, 0.39) < cost(1.0, 0.39) < cost(4.0, 0.05) < 27 * x.size**2
+    # One ray a pixel at least; uniform supersampling has 64 or more and does not reach the same error.
+    assert x.size**2 < cost(0.5, 0.39) < 4 * x.size**2
+    assert cost(1.0, 0.39) < cost(4.0, 0.39) < cost(4.0, 0.05) < 27 * x.size**2
 
 
 def test_the_same_bits_every_time_and_flux_is_linear() -> None:
@@ -348,7 +347,7 @@ def test_what_cannot_be_rendered_is_refused_by_name() -> None:
     profile = SersicProfile(1.0, 0.2, 4.0, 0.7, 0.3)
     with pytest.raises(SpecError, match="tolerance"):
         render_sersic(profile, GRID, GRID, 0.08, tolerance=0.0)
-    with pytest.raises(SpecError, match="y: .*pixel_scale"):
+    with pytest.raises(SpecError, match=r"(?s)y: .*pixel_scale"):
         render_sersic(profile, GRID, GRID * 1.1, 0.08)
 
 
