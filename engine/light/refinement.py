@@ -29,7 +29,7 @@ MAX_DEPTH = 40
 _CUSP_SHARE = 1.0 / 16.0
 """Part of a pixel's tolerance for a cell with the cusp; there are as many as its neighbours, whatever the level."""
 
-_CLEARANCE = 0.75
+_CLEARANCE = 1.0
 """Distance of a cell from the cusp in units of its size from which both rules see it."""
 
 _G3 = math.sqrt(0.6)
