@@ -46,7 +46,7 @@ def main() -> None:
             shape_native=(scene["pixels"], scene["pixels"]), pixel_scales=scene["scale"], over_sample_size=subpixels
         )
         times = []
-        for _ in range(4):
+        for _ in range(10):
             began = time.perf_counter()
             image = tracer.image_2d_from(grid=grid)
             times.append(time.perf_counter() - began)
