@@ -14,6 +14,7 @@ from rich.console import Console
 
 from service import VERSION
 from service.client import ApiError, Client
+from service.pictures import COMMANDS
 from service.settings import Settings
 from service.tables import grid_line, runs_table, summary_table
 from service.watch import progress
@@ -26,6 +27,8 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
+for command in COMMANDS:
+    app.command()(command)
 
 Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]
 Floats = Annotated[list[float] | None, typer.Option()]
