@@ -41,6 +41,7 @@ def read_foreign_observation(
     exposure_s: float | None = None,
     gain: float = 1.0,
     saturation_e_s: float | None = None,
+    sky_rms_e_s: float | None = None,
     recentre_psf: PsfCentre | None = None,
     normalise_psf: bool = False,
 ) -> Observation:
@@ -67,6 +68,8 @@ def read_foreign_observation(
         Electrons per count, should the image be in counts after all.
     saturation_e_s
         Rate [e-/s] from which on a pixel is saturated: it and its neighbours become invalid. With no noise map only.
+    sky_rms_e_s
+        Noise of the empty sky, where it is known better than the image tells. With no noise map only.
     recentre_psf, normalise_psf
         What may be done to the PSF; see :func:`~engine.imaging.foreign.observation_from_arrays`.
 
@@ -93,7 +96,7 @@ def read_foreign_observation(
     if noise is not None:
         sigma = found["noise"].values * factor
     elif seconds is not None:
-        sigma = NoiseFromImage(exposure_s=float(seconds), saturation=saturation_e_s)
+        sigma = NoiseFromImage(exposure_s=float(seconds), saturation=saturation_e_s, sky_rms=sky_rms_e_s)
     record: dict[str, str | float | int] = {f"{role}_file": Path(path).name for role, path in files.items() if path}
     record |= {"unit": unit, "gain": float(gain)} | ({} if seconds is None else {"exposure_s": float(seconds)})
     try:

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from scipy.special import gammaincinv
 
-from engine.catalogue import load_camera, load_dither, load_system, read_catalogue, system_facts, system_names
+from engine.catalogue import load_camera, load_dither, load_system, system_facts, system_names
 from engine.conventions import sky_to_image
 from engine.grid import Grid, expand
 from engine.lensing.lens_equation import solve_lens_equation
