@@ -147,6 +147,16 @@ def _paper_values(system: str) -> dict[str, float | None]:
     return {"r_eff": min(host.r_eff for host in hosts), "magnitude": sorted({host.magnitude for host in hosts})[1]}
 
 
+def named_or_read(system: str) -> str | dict[str, Any]:
+    """A system for a request: the name as it is, a file as the table that it holds."""
+    if not system.lower().endswith(_FILES):
+        return system
+    with _refusals():
+        from engine import read_mapping  # noqa: PLC0415
+
+        return read_mapping(system)
+
+
 def _camera(choice: str | None) -> str | Camera | None:
     if choice is None or not choice.lower().endswith(_FILES):
         return choice
