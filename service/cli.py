@@ -139,7 +139,8 @@ def submit(
     request = {} if file is None else json.loads(file.read_text(encoding="utf-8"))
     options = {
         "preset": preset, "systems": [named_or_read(entry) for entry in system or []],
-        "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed, "replicates": replicates, "name": name,
+        "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed,
+        "replicates": replicates, "name": name,
     }  # fmt: skip
     request |= {option: value for option, value in options.items() if value not in (None, [])}
     with _Talk(url) as client:

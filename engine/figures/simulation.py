@@ -126,7 +126,7 @@ def gallery_figure(simulations: Sequence[Simulation]) -> Figure:
     """
     pairs_in_row = 2
     rows = -(-len(simulations) // pairs_in_row)
-    figure = Figure(figsize=(10.4, 2.62 * rows + 0.75), layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03))
+    figure = Figure(figsize=(9.6, 2.42 * rows + 0.75), layout=ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.03))
     axes = figure.subplots(rows, 2 * pairs_in_row, squeeze=False)
     sigmas = [empty_sky_noise(simulation.observation.noise) for simulation in simulations]
     peak = max(
