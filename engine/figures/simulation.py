@@ -25,8 +25,9 @@ from engine.imaging.observation import Observation
 from engine.scene import resolve_system
 from engine.simulation import Simulation
 
+# Panels this small show arcs, not the sky.
+_GALLERY_LINEAR = 10.0
 _MONTAGE_LINEAR = 20.0
-"""Panels this small show arcs, not the sky."""
 _MONTAGE_MARGIN = 1.8
 _BRIGHTNESS = "e$^-$ s$^{-1}$ arcsec$^{-2}$"
 
@@ -132,7 +133,7 @@ def gallery_figure(simulations: Sequence[Simulation]) -> Figure:
     peak = max(
         float(simulation.observation.image.max()) / sigma for simulation, sigma in zip(simulations, sigmas, strict=True)
     )
-    norm = stretch(1.0, peak)
+    norm = stretch(1.0, peak, linear=_GALLERY_LINEAR)
     for panel in axes.flat:
         panel.set_axis_off()
     for index, (simulation, sigma) in enumerate(zip(simulations, sigmas, strict=True)):

@@ -74,8 +74,8 @@ def compass(axes: Axes, half_width: float, *, fontsize: float = 8.0) -> None:
             arrowprops={"arrowstyle": "-|>", "color": "white", "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0},
         )  # fmt: skip
         axes.text(
-            x + 1.3 * dx, y + 1.3 * dy, name, color="white", fontsize=fontsize, ha="center", va="center",
-            path_effects=_STROKE,
+            x + 1.3 * dx, y + 1.3 * dy, name, color="white", fontsize=fontsize, fontweight="bold",
+            ha="center", va="center", path_effects=_STROKE,
         )  # fmt: skip
 
 

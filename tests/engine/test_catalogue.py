@@ -14,7 +14,7 @@ from engine.conventions import sky_to_image
 from engine.grid import Grid, expand
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import magnification, source_position
-from engine.light.sersic import SersicProfile
+from engine.light.sersic import SersicProfile, surface_brightness
 from engine.scene import build_scene, check_system, power_law_lens
 from engine.spec import Host, Realization
 
@@ -305,6 +305,16 @@ def test_the_agn_of_sdss1206_is_double_and_a_part_of_its_host_quadruple(r_eff, n
     polygon = astroid(scene.lens)
     assert not in_polygon(polygon, [(scene.host.x, scene.host.y)])[0]
     assert in_polygon(polygon, host_points(scene.host, 20_000)).mean() == pytest.approx(share, abs=0.005)
+
+
+def test_what_is_quadruple_makes_two_fifths_of_the_hosts_light_in_the_image():
+    # 0.405 from 600 solutions of the lens equation, whose sampling error is 0.02; here by tracing rays of 0.02 arcsec.
+    scene = build_scene(Realization(system="SDSS1206", l_eta=1.0, host=Host(n=2, r_eff=0.39, magnitude=20.5)))
+    axis = np.arange(-4.0, 4.0, 0.02) + 0.013
+    x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
+    sources = np.column_stack(source_position(scene.lens, x, y))
+    light = surface_brightness(scene.host, sources[:, 0], sources[:, 1])
+    assert light[in_polygon(astroid(scene.lens), sources)].sum() / light.sum() == pytest.approx(0.405, abs=0.03)
 
 
 def test_the_lens_equation_has_four_images_inside_the_astroid_of_sdss1206_and_fewer_outside():

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from engine import read_observation, realization_from_dict, system_from_mapping
 from service.api.app import create_app
 from service.cli import app
+from service.pictures import named_or_read
 from service.settings import Settings
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
@@ -155,3 +156,8 @@ def test_help_does_not_load_the_engine() -> None:
         "import sys, service.cli; sys.exit(any(name.split('.')[0] in ('engine', 'matplotlib') for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_request_names_systems_and_carries_the_tables_of_those_in_files() -> None:
+    assert named_or_read("HE0435") == "HE0435"
+    assert named_or_read(str(EXAMPLES / "my_system.toml")) == OWN
