@@ -4,6 +4,7 @@ This module is the engine's public face: everything that ``service`` or a user m
 """
 
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
+from engine.catalogue.user_files import read_camera, read_mapping, read_system
 from engine.digest import engine_digest, engine_versions
 from engine.errors import (
     EngineError,
@@ -14,24 +15,36 @@ from engine.errors import (
     SpecError,
 )
 from engine.grid import Grid, GridRun, expand, preset_names
+from engine.imaging.fits import read_observation, write_observation
+from engine.imaging.foreign import NoiseFromImage, observation_from_arrays
+from engine.imaging.foreign_files import read_foreign_observation
+from engine.imaging.observation import Observation
 from engine.result import ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
-from engine.run import STAGES, Measurement, Truth, generator, measure, run
+from engine.run import STAGES, Measurement, Truth, measure, run
+from engine.scene import check_system
+from engine.seeds import generator
+from engine.simulation import Simulation, simulate_realization
 from engine.spec import (
     Analysis,
     Camera,
+    CameraChoice,
     Host,
     LensSystem,
     NoiseLevel,
     Optics,
     Realization,
+    SystemChoice,
+    camera_from_mapping,
     realization_from_dict,
-    spec_error,
+    system_from_mapping,
 )
+from engine.validation import field_steps, spec_error
 
 __all__ = [
     "STAGES",
     "Analysis",
     "Camera",
+    "CameraChoice",
     "ChainSummary",
     "EngineError",
     "Estimate",
@@ -43,7 +56,9 @@ __all__ = [
     "LensParameter",
     "LensSystem",
     "Measurement",
+    "NoiseFromImage",
     "NoiseLevel",
+    "Observation",
     "ObservationError",
     "Optics",
     "PosteriorError",
@@ -51,21 +66,35 @@ __all__ = [
     "Quantity",
     "Realization",
     "RunResult",
+    "Simulation",
     "SpecError",
     "StageTime",
+    "SystemChoice",
     "Truth",
+    "camera_from_mapping",
     "camera_names",
+    "check_system",
     "engine_digest",
     "engine_versions",
     "expand",
+    "field_steps",
     "generator",
     "load_camera",
     "load_system",
     "measure",
+    "observation_from_arrays",
     "preset_names",
+    "read_camera",
+    "read_foreign_observation",
+    "read_mapping",
+    "read_observation",
+    "read_system",
     "realization_from_dict",
     "run",
+    "simulate_realization",
     "spec_error",
     "system_facts",
+    "system_from_mapping",
     "system_names",
+    "write_observation",
 ]

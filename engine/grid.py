@@ -9,9 +9,22 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from engine.catalogue import load_system, read_catalogue
+from engine.catalogue import load_camera, load_dither, load_system, read_catalogue
 from engine.errors import SpecError
-from engine.spec import Analysis, Host, Identifier, Magnitude, NoiseLevel, Optics, Radius, Realization, SersicIndex
+from engine.spec import (
+    Analysis,
+    CameraChoice,
+    Host,
+    Identifier,
+    LensSystem,
+    Magnitude,
+    NoiseLevel,
+    Optics,
+    Radius,
+    Realization,
+    SersicIndex,
+    SystemChoice,
+)
 
 PAPER = "h0licow-vi"
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -23,12 +36,13 @@ class Grid:
 
     With ``preset`` (``h0licow-vi`` for all eight systems, ``h0licow-vi/HE0435`` for one) the values are those of the
     paper's Table 2, and n, r_eff, magnitude, l_eta cut them: each must then be a subset of the preset's values.
-    Without it, ``systems`` and all four lists of values must be given and every combination is run. ``replicates``
-    repeats each point with seeds seed, seed + 1, ...
+    Without it, ``systems`` (names of the catalogue, or lens systems of one's own) and all four lists of values must be
+    given and every combination is run. ``camera`` takes the place of the systems' own. ``replicates`` repeats each
+    point with seeds seed, seed + 1, ...
     """
 
     preset: Identifier | None = None
-    systems: tuple[Identifier, ...] | None = None
+    systems: tuple[SystemChoice, ...] | None = None
     n: tuple[SersicIndex, ...] | None = None
     r_eff: tuple[Radius, ...] | None = None
     magnitude: tuple[Magnitude, ...] | None = None
@@ -39,6 +53,7 @@ class Grid:
     seed: Annotated[int, Field(ge=0, le=2**62)] = 0
     replicates: Annotated[int, Field(ge=1, le=100_000)] = 1
     analysis: Analysis = Field(default_factory=Analysis)
+    camera: CameraChoice | None = None
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -58,9 +73,9 @@ def preset_names() -> tuple[str, ...]:
 def expand(grid: Grid) -> tuple[GridRun, ...]:
     """All runs of a grid in a fixed order; a SpecError says which value is not allowed and what is."""
     points = _paper_points(grid) if grid.preset is not None else _free_points(grid)
+    _require_known_parts(grid, points)
     runs = []
     for (system, number, host, l_eta), replicate in product(points, range(grid.replicates)):
-        load_system(system).mass_model(grid.mass_model, l_eta)
         realization = Realization(
             system=system,
             l_eta=l_eta,
@@ -69,15 +84,31 @@ def expand(grid: Grid) -> tuple[GridRun, ...]:
             noise_level=grid.noise_level,
             optics=grid.optics,
             mass_model=grid.mass_model,
+            camera=grid.camera,
             analysis=grid.analysis,
         )
         name = f"{number:02d}" if number is not None else f"n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{l_eta:g}"
         suffix = f"#{replicate + 1}" if grid.replicates > 1 else ""
-        runs.append(GridRun(label=f"{system}/{name}{suffix}", paper_run=number, realization=realization))
+        runs.append(
+            GridRun(label=f"{realization.system_name}/{name}{suffix}", paper_run=number, realization=realization)
+        )
     return tuple(runs)
 
 
-_Point = tuple[str, int | None, Host, float]
+_Point = tuple[str | LensSystem, int | None, Host, float]
+
+
+def _require_known_parts(grid: Grid, points: Sequence[_Point]) -> None:
+    """Every camera, dither pattern and mass model that the points name must be there."""
+    if isinstance(grid.camera, str):
+        load_camera(grid.camera)
+    for choice, _, _, l_eta in points:
+        system = load_system(choice) if isinstance(choice, str) else choice
+        system.mass_model(grid.mass_model, l_eta)
+        if isinstance(system.camera, str):
+            load_camera(system.camera)
+        if isinstance(system.exposures.dither, str):
+            load_dither(system.exposures.dither)
 
 
 def _paper_points(grid: Grid) -> list[_Point]:
@@ -87,8 +118,11 @@ def _paper_points(grid: Grid) -> list[_Point]:
     _, _, only = grid.preset.partition("/")
     names = [only] if only else list(table["systems"])
     if grid.systems is not None:
-        _require_subset("systems", grid.systems, names)
-        names = [name for name in names if name in grid.systems]
+        wanted = [_name(system) for system in grid.systems]
+        if not all(isinstance(system, str) for system in grid.systems):
+            raise SpecError("systems", wanted, "names of the catalogue where there is a preset")
+        _require_subset("systems", wanted, names)
+        names = [name for name in names if name in wanted]
     serials = {entry["serial"]: entry for entry in table["serials"]}
     known = {
         "n": {float(entry["n"]) for entry in serials.values()},
@@ -120,13 +154,19 @@ def _free_points(grid: Grid) -> list[_Point]:
     systems, n, r_eff, magnitude, l_eta = grid.systems, grid.n, grid.r_eff, grid.magnitude, grid.l_eta
     if systems is None or n is None or r_eff is None or magnitude is None or l_eta is None:
         raise AssertionError("checked above")
-    for field in ("systems", "n", "r_eff", "magnitude", "l_eta"):
-        if len(set(getattr(grid, field))) != len(getattr(grid, field)):
-            raise SpecError(field, getattr(grid, field), "a list without repeated values")
+    values: dict[str, Sequence[object]] = {"n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta}
+    values["systems"] = [_name(system) for system in systems]
+    for field, entries in values.items():
+        if len(set(entries)) != len(entries):
+            raise SpecError(field, entries, "a list without repeated values")
     return [
         (system, None, Host(n=index, r_eff=radius, magnitude=brightness), slope)
         for system, slope, radius, index, brightness in product(systems, l_eta, r_eff, n, magnitude)
     ]
+
+
+def _name(system: str | LensSystem) -> str:
+    return system if isinstance(system, str) else system.name
 
 
 def _require_subset(field: str, values: Sequence[object] | None, allowed: Sequence[object]) -> None:

@@ -39,8 +39,8 @@ from engine.result import (
     RunResult,
     StageTime,
 )
-from engine.scene import build_scene
-from engine.simulation import simulate
+from engine.seeds import generator
+from engine.simulation import simulate_realization
 from engine.spec import NOMINAL_OPTICS, Analysis, Realization
 
 Progress = Callable[[str, float], None]
@@ -86,12 +86,6 @@ class Measurement:
     degrees_of_freedom: int
     products: Products
     warnings: tuple[str, ...]
-
-
-def generator(realization: Realization, purpose: int) -> np.random.Generator:
-    """The random generator of a realization for one purpose: equal specs give equal streams."""
-    key = int(realization.digest[:16], 16)
-    return np.random.default_rng(np.random.SeedSequence([realization.seed, key, purpose]))
 
 
 def _lens_parameters(target: Target, chain: Chain, truth: Truth | None) -> tuple[LensParameter, ...]:
@@ -266,8 +260,8 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
     # One thread: a worker is given one core, and sums in a fixed order give the same bits everywhere.
     with threadpool_limits(1):
         with watch.stage("simulate"):
-            scene = build_scene(realization)
-            simulation = simulate(scene, realization.noise_level, generator(realization, 0))
+            simulation = simulate_realization(realization)
+            scene = simulation.scene
         found = measure(
             simulation.observation,
             realization.analysis,

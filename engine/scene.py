@@ -7,13 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from engine.catalogue import load_camera, load_system
+from engine.catalogue import load_camera, load_dither, load_system
 from engine.conventions import image_angle, magnitude_to_rate, sky_to_image, sky_to_image_shear
 from engine.errors import SpecError
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.spec import NOMINAL_OPTICS, AgnImage, Camera, LensSystem, MassModel, Optics, Realization, SersicLight
+from engine.spec import (
+    NOMINAL_OPTICS,
+    AgnImage,
+    Camera,
+    Dither,
+    LensSystem,
+    MassModel,
+    Optics,
+    Realization,
+    SersicLight,
+)
 
 
 @dataclass(frozen=True)
@@ -51,6 +61,34 @@ def resolve_camera(realization: Realization) -> Camera:
     if camera is None:
         camera = resolve_system(realization).camera
     return load_camera(camera) if isinstance(camera, str) else camera
+
+
+def resolve_dither(system: LensSystem) -> Dither:
+    """The dither pattern of a system's exposures, from the catalogue where it is named."""
+    dither = system.exposures.dither
+    return load_dither(dither) if isinstance(dither, str) else dither
+
+
+def check_system(system: LensSystem) -> None:
+    """Refuse a system that cannot be simulated.
+
+    Its camera and dither pattern must be known, and each of its mass models must make as many images of the AGN as
+    ``agn`` lists (any number where it lists none); a SpecError names the field.
+    """
+    if isinstance(system.camera, str):
+        load_camera(system.camera)
+    resolve_dither(system)
+    for model, by_slope in system.mass_models.items():
+        for l_eta, mass in by_slope.items():
+            if not system.agn:
+                continue
+            images = solve_lens_equation(power_law_lens(mass), *sky_to_image(mass.source_position))
+            if len(images) != len(system.agn):
+                raise SpecError(
+                    "agn",
+                    [image.name for image in system.agn],
+                    f"{len(images)} images, as many as mass_models.{model}[{l_eta!r}] makes of its source",
+                )
 
 
 def power_law_lens(mass: MassModel) -> PowerLawLens:

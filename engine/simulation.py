@@ -5,14 +5,16 @@ Scene -> noiseless high-resolution image -> dithered noisy exposures -> drizzled
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from engine.catalogue import load_dither
-from engine.conventions import FloatArray, rate_to_magnitude
+from engine.conventions import FloatArray, position_angle, rate_to_magnitude
+from engine.digest import engine_digest, engine_versions
 from engine.imaging.blurring import convolve, point_source_image
 from engine.imaging.cusps import place_cusps
 from engine.imaging.drizzled_psf import DrizzledPsf, drizzled_psf
@@ -20,17 +22,20 @@ from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covarian
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
-from engine.imaging.observation import Observation
+from engine.imaging.observation import Observation, Provenance
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.imaging.response import PointResponse
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
-from engine.scene import Scene
-from engine.spec import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
+from engine.scene import Scene, build_scene, resolve_dither
+from engine.seeds import generator
+from engine.spec import NOMINAL_OPTICS, Camera, NoiseLevel, Optics, Realization
 
 _PSF_REACH = 5.0
 """Half-width [arcsec] of the drizzled PSF stamp at most; beyond it lies less than 2 % of a star."""
 _PSF_FIELD_SHARE = 0.75
+_SIMULATION = 0
+"""The purpose of the random generator that draws the noise."""
 
 
 @dataclass(frozen=True)
@@ -45,21 +50,26 @@ class Exposures:
 
 @dataclass(frozen=True)
 class Simulation:
-    """A simulated observation with what made it, and the truth that only the simulation knows.
+    """A simulated observation with every step on the way to it, and the truth that only the simulation knows.
 
-    ``arc`` is the noiseless drizzled image of the lensed host alone; ``arc_magnitude`` its total AB magnitude.
+    ``high_resolution_arc`` is the lensed host before the PSF and ``high_resolution_image`` everything after it, both
+    without noise [e-/s per sub-pixel]; ``arc`` is the noiseless drizzled image of the lensed host alone;
+    ``arc_magnitude`` its total AB magnitude.
     """
 
-    observation: Observation
+    scene: Scene
+    high_resolution_arc: FloatArray
+    high_resolution_image: FloatArray
     exposures: Exposures
+    observation: Observation
     arc: FloatArray
     arc_magnitude: float
 
 
 def scene_geometry(scene: Scene) -> Geometry:
     """Sampling of a scene's exposures and drizzled image."""
-    plan = scene.system.exposures
-    return exposure_geometry(scene.camera, load_dither(plan.dither), (plan.field_pixels, plan.field_pixels))
+    side = scene.system.exposures.field_pixels
+    return exposure_geometry(scene.camera, resolve_dither(scene.system), (side, side))
 
 
 def optical_psf(camera: Camera, oversampling: int, optics: Optics = NOMINAL_OPTICS) -> FloatArray:
@@ -114,8 +124,11 @@ def simulate_exposures(
     return Exposures(noiseless, noiseless + draw_noise(noise, rng), noise, geometry)
 
 
-def combine(scene: Scene, exposures: Exposures) -> Observation:
-    """Drizzle exposures into an observation with noise map, covariance and the camera's nominal PSF."""
+def combine(scene: Scene, exposures: Exposures, provenance: Provenance | None = None) -> Observation:
+    """Drizzle exposures into an observation with noise map, covariance and the camera's nominal PSF.
+
+    ``provenance`` is added to the observation's own.
+    """
     geometry = exposures.geometry
     covariance = drizzled_covariance(exposures.noise.variance, geometry)
     # A saturated native pixel spoils every drizzled pixel that it has a share in.
@@ -128,23 +141,40 @@ def combine(scene: Scene, exposures: Exposures) -> Observation:
         zero_point=scene.camera.zero_point,
         covariance=covariance,
         valid=(spoilt == 0).reshape(geometry.drizzled_shape),
-        provenance={
-            "SYSTEM": scene.system.name,
-            "CAMERA": scene.camera.name,
-            "NOISE": exposures.noise.level,
-            "DITHER": scene.system.exposures.dither,
-            "PIXFRAC": geometry.pixfrac,
-            "KERNEL": geometry.kernel,
-            "DEFOCUS": scene.optics.defocus_nm,
-            "JITTER": scene.optics.jitter,
-        },
+        provenance={**_exposure_record(scene, exposures), **(provenance or {})},
+        centre=scene.system.coordinates,
         response=PointResponse(
             optical_psf(scene.camera, geometry.oversampling), geometry, detector_kernel(scene.camera)
         ),
     )
 
 
-def simulate(scene: Scene, noise_level: NoiseLevel, rng: np.random.Generator) -> Simulation:
+def _exposure_record(scene: Scene, exposures: Exposures) -> dict[str, str | float | int]:
+    """How an observation was taken, as its provenance has it."""
+    geometry, plan, noise = exposures.geometry, scene.system.exposures, exposures.noise
+    return {
+        "SYSTEM": scene.system.name,
+        "CAMERA": scene.camera.name,
+        "NOISE": noise.level,
+        "NOISEREQ": noise.requested,
+        "DITHER": resolve_dither(scene.system).name,
+        "N_DITHER": geometry.n_dither,
+        "N_LONG": plan.n_long,
+        "LONG_S": plan.long_s,
+        "SHORT_S": plan.short_s,
+        "EXPTIME": geometry.n_dither * (plan.n_long * plan.long_s + plan.short_s),
+        "PIXFRAC": geometry.pixfrac,
+        "KERNEL": geometry.kernel,
+        "N_SHORT": int(np.count_nonzero(noise.short)),
+        "N_SATUR": int(np.count_nonzero(noise.saturated)),
+        "DEFOCUS": scene.optics.defocus_nm,
+        "JITTER": scene.optics.jitter,
+    }
+
+
+def simulate(
+    scene: Scene, noise_level: NoiseLevel, rng: np.random.Generator, provenance: Provenance | None = None
+) -> Simulation:
     """The whole forward simulation of a scene."""
     geometry = scene_geometry(scene)
     host = high_resolution_host(scene, geometry)
@@ -152,8 +182,49 @@ def simulate(scene: Scene, noise_level: NoiseLevel, rng: np.random.Generator) ->
     image = high_resolution_image(scene, geometry, arc)
     exposures = simulate_exposures(scene, geometry, image, noise_level, rng)
     return Simulation(
-        observation=combine(scene, exposures),
+        scene=scene,
+        high_resolution_arc=host,
+        high_resolution_image=image,
         exposures=exposures,
+        observation=combine(scene, exposures, provenance),
         arc=drizzle(expose(arc, geometry, detector_kernel(scene.camera)), geometry),
         arc_magnitude=rate_to_magnitude(float(host.sum()), scene.camera.zero_point),
     )
+
+
+def simulate_realization(realization: Realization) -> Simulation:
+    """The forward simulation that a run of this realization starts with: same realization, same bits.
+
+    The provenance of the observation holds the whole specification, its digest, the digest of the engine and the
+    versions of what its numbers depend on.
+
+    Raises
+    ------
+    SpecError
+        The realization asks for something that is not there.
+    """
+    scene = build_scene(realization)
+    # One thread: sums in a fixed order give the same bits everywhere.
+    with threadpool_limits(1):
+        return simulate(
+            scene, realization.noise_level, generator(realization, _SIMULATION), realization_record(scene, realization)
+        )
+
+
+def realization_record(scene: Scene, realization: Realization) -> dict[str, str | float | int]:
+    """What was asked for and by what it was computed, as the provenance of an observation has it."""
+    host = scene.host
+    return {
+        "MASSMOD": realization.mass_model,
+        "L_ETA": realization.l_eta,
+        "HOST_MAG": realization.host.magnitude,
+        "HOST_RE": host.r_eff,
+        "HOST_N": host.n,
+        "HOST_Q": host.q,
+        "HOST_PA": position_angle(host.phi),
+        "SEED": realization.seed,
+        "SPECDIG": realization.digest,
+        "ENGDIG": engine_digest(),
+        "VERSIONS": json.dumps(engine_versions(), sort_keys=True),
+        "SPEC": json.dumps(realization.to_dict(), sort_keys=True, separators=(",", ":")),
+    }

@@ -8,26 +8,45 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, Discriminator, Field, Strict, Tag, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 from engine.errors import SpecError
+from engine.validation import NAME_TAG, OBJECT_TAG, name_or_object, spec_error
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-AxisRatio = Annotated[float, Field(ge=0.05, le=1.0)]
-Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
-Magnitude = Annotated[float, Field(ge=5.0, le=40.0)]
-SersicIndex = Annotated[float, Field(ge=0.3, le=10.0)]
-Radius = Annotated[float, Field(gt=1e-4, le=60.0)]
-Coordinate = Annotated[float, Field(ge=-60.0, le=60.0)]
+# Strict, or a file's true would be the number 1 and its "20.5" a number.
+Number = Annotated[float, Strict()]
+Count = Annotated[int, Strict()]
+AxisRatio = Annotated[Number, Field(ge=0.05, le=1.0)]
+Angle = Annotated[Number, Field(ge=-360.0, le=360.0)]
+Magnitude = Annotated[Number, Field(ge=5.0, le=40.0)]
+SersicIndex = Annotated[Number, Field(ge=0.3, le=10.0)]
+Radius = Annotated[Number, Field(gt=1e-4, le=60.0)]
+Coordinate = Annotated[Number, Field(ge=-60.0, le=60.0)]
 Position = tuple[Coordinate, Coordinate]
+Positive = Annotated[Number, Field(gt=0.0)]
+NotNegative = Annotated[Number, Field(ge=0.0)]
+Fraction = Annotated[Number, Field(ge=0.0, lt=1.0)]
+Scale = Annotated[Number, Field(gt=0.0, le=1.0)]
+Shear = Annotated[Number, Field(ge=-0.7, le=0.7)]
+Shift = Annotated[Count, Field(ge=-64, le=64)]
+ZernikeTerm = Annotated[Count, Field(ge=1, le=200)]
+KernelRow = tuple[NotNegative, NotNegative, NotNegative]
+RightAscension = Annotated[Number, Field(ge=0.0, lt=360.0)]
+Declination = Annotated[Number, Field(ge=-90.0, le=90.0)]
+Exposure = Annotated[Number, Field(gt=0.0, le=1e5)]
 Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$")]
 NoiseLevel = Literal["author", "handbook"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
 RegularisationName = Literal["zeroth", "gradient", "curvature"]
+_Read = TypeVar("_Read")
+_SLOPE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -39,13 +58,13 @@ class MassModel:
     behind the lens [arcsec].
     """
 
-    theta_E: Annotated[float, Field(gt=0.0, le=30.0)]
+    theta_E: Annotated[Number, Field(gt=0.0, le=30.0)]
     q: AxisRatio
     position_angle: Angle
-    slope: Annotated[float, Field(ge=1.2, le=2.8)]
+    slope: Annotated[Number, Field(ge=1.2, le=2.8)]
     source_position: Position
     centre: Position = (0.0, 0.0)
-    shear: tuple[float, float] | None = None
+    shear: tuple[Shear, Shear] | None = None
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -70,72 +89,62 @@ class AgnImage:
 
 
 @dataclass(frozen=True, config=_STRICT)
-class ExposurePlan:
-    """What is taken at each dither position: ``n_long`` exposures of ``long_s`` and one of ``short_s`` seconds.
+class Dither:
+    """Dither pattern: (x, y) shifts in sub-pixels, ``subpixels`` to the native pixel."""
 
-    ``field_pixels`` is the side of the drizzled image.
-    """
+    name: Identifier
+    subpixels: Annotated[Count, Field(ge=1, le=12)]
+    shifts: Annotated[tuple[tuple[Shift, Shift], ...], Field(min_length=1, max_length=64)]
 
-    field_pixels: Annotated[int, Field(ge=16, le=1000)]
-    dither: Identifier
-    long_s: Annotated[float, Field(gt=0.0, le=1e5)]
-    n_long: Annotated[int, Field(ge=1, le=100)]
-    short_s: Annotated[float, Field(gt=0.0, le=1e5)]
+
+DitherChoice = Annotated[
+    Annotated[Identifier, Tag(NAME_TAG)] | Annotated[Dither, Tag(OBJECT_TAG)], Discriminator(name_or_object)
+]
 
 
 @dataclass(frozen=True, config=_STRICT)
-class LensSystem:
-    """A lensed AGN as observed: camera, exposures, AGN images, deflector light and mass models by name and l_eta."""
+class ExposurePlan:
+    """What is taken at each dither position: ``n_long`` exposures of ``long_s`` and one of ``short_s`` seconds.
 
-    name: Identifier
-    camera: Identifier
-    exposures: ExposurePlan
-    agn: tuple[AgnImage, ...]
-    deflector: SersicLight | None
-    host_q: AxisRatio
-    host_position_angle: Angle
-    mass_models: dict[str, dict[str, MassModel]]
+    ``field_pixels`` is the side of the drizzled image; ``dither`` names a pattern of the catalogue or is one.
+    """
 
-    def mass_model(self, name: str, l_eta: float) -> MassModel:
-        """The mass model called ``name`` at slope l_eta; a SpecError names what there is."""
-        if name not in self.mass_models:
-            raise SpecError("mass_model", name, f"one of {sorted(self.mass_models)} for {self.name}")
-        by_slope = self.mass_models[name]
-        key = f"{l_eta:.1f}"
-        if key not in by_slope or abs(float(key) - l_eta) > 1e-9:
-            raise SpecError("l_eta", l_eta, f"one of {sorted(map(float, by_slope))} for {self.name}/{name}")
-        return by_slope[key]
+    field_pixels: Annotated[Count, Field(ge=16, le=1000)]
+    dither: DitherChoice
+    long_s: Exposure
+    n_long: Annotated[Count, Field(ge=1, le=100)]
+    short_s: Exposure
 
 
 @dataclass(frozen=True, config=_STRICT)
 class AuthorNoise:
     """Background level as the paper's scripts used it: e-/s per native pixel of one long and one short exposure."""
 
-    std_long_e_s: Annotated[float, Field(gt=0.0)]
-    std_short_e_s: Annotated[float, Field(gt=0.0)]
-    bright_threshold_e_s: Annotated[float, Field(gt=0.0)]
+    std_long_e_s: Positive
+    std_short_e_s: Positive
+    bright_threshold_e_s: Positive
 
 
 @dataclass(frozen=True, config=_STRICT)
 class ColdMask:
     """Cold stop of WFC3-IR: obscurations in fractions of the primary's radius."""
 
-    secondary: float
-    spider_width: float
-    outer_radius: float
+    secondary: Fraction
+    spider_width: Fraction
+    outer_radius: Scale
 
 
 @dataclass(frozen=True, config=_STRICT)
 class Pupil:
     """Telescope pupil: primary diameter [m]; the other lengths in fractions of the primary's radius."""
 
-    primary_diameter_m: float
-    secondary: float
-    spider_width: float
-    pads: tuple[tuple[float, float, float], ...]
-    rotation_deg: float
+    primary_diameter_m: Annotated[Number, Field(gt=0.0, le=100.0)]
+    secondary: Fraction
+    spider_width: Fraction
+    pads: tuple[tuple[Number, Number, Fraction], ...]
+    rotation_deg: Angle
     cold_mask: ColdMask | None = None
-    zernike_waves_at_547nm: tuple[tuple[int, float], ...] = ()
+    zernike_waves_at_547nm: tuple[tuple[ZernikeTerm, Number], ...] = ()
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -147,32 +156,95 @@ class Camera:
     """
 
     name: Identifier
-    pixel_scale: Annotated[float, Field(gt=0.0, le=1.0)]
-    drizzled_scale: Annotated[float, Field(gt=0.0, le=1.0)]
-    pixfrac: Annotated[float, Field(gt=0.0, le=1.0)]
+    pixel_scale: Scale
+    drizzled_scale: Scale
+    pixfrac: Scale
     drizzle_kernel: Literal["square", "turbo", "gaussian", "point"]
-    oversampling: Annotated[int, Field(ge=1, le=12)]
+    oversampling: Annotated[Count, Field(ge=1, le=12)]
     zero_point: Magnitude
-    gain: float
-    full_well_e: float
-    read_noise_e: float
-    read_noise_short_e: float
-    dark_e_s: float
-    sky_e_s: float
-    noise_author: AuthorNoise | None
-    wavelength_nm: tuple[float, ...]
-    throughput: tuple[float, ...]
+    gain: Positive
+    full_well_e: Positive
+    read_noise_e: NotNegative
+    read_noise_short_e: NotNegative
+    dark_e_s: NotNegative
+    sky_e_s: NotNegative
+    wavelength_nm: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=1000)]
+    throughput: tuple[NotNegative, ...]
     pupil: Pupil
-    detector_kernel: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+    detector_kernel: tuple[KernelRow, KernelRow, KernelRow]
+    noise_author: AuthorNoise | None = None
+
+    @model_validator(mode="after")
+    def _band_and_kernel(self) -> Camera:
+        wavelengths = self.wavelength_nm
+        if any(b <= a for a, b in pairwise(wavelengths)):
+            raise SpecError("wavelength_nm", wavelengths, "wavelengths that increase")
+        if len(self.throughput) != len(wavelengths):
+            raise SpecError("throughput", f"{len(self.throughput)} values", f"one for each of {len(wavelengths)} nm")
+        if not sum(self.throughput) > 0:
+            raise SpecError("throughput", self.throughput, "values of which one at least is positive")
+        if not sum(map(sum, self.detector_kernel)) > 0:
+            raise SpecError("detector_kernel", self.detector_kernel, "a kernel with a positive sum")
+        return self
+
+
+CameraChoice = Annotated[
+    Annotated[Identifier, Tag(NAME_TAG)] | Annotated[Camera, Tag(OBJECT_TAG)], Discriminator(name_or_object)
+]
 
 
 @dataclass(frozen=True, config=_STRICT)
-class Dither:
-    """Dither pattern: (x, y) shifts in sub-pixels, ``subpixels`` to the native pixel."""
+class LensSystem:
+    """A lensed AGN as observed: camera, exposures, AGN images, deflector light and mass models by name and l_eta.
+
+    ``camera`` names one of the catalogue or is one; ``coordinates`` are RA and Dec [deg, ICRS] of the centre of the
+    image, None where they do not matter.
+    """
 
     name: Identifier
-    subpixels: Annotated[int, Field(ge=1, le=12)]
-    shifts: tuple[tuple[int, int], ...]
+    camera: CameraChoice
+    exposures: ExposurePlan
+    agn: tuple[AgnImage, ...]
+    host_q: AxisRatio
+    host_position_angle: Angle
+    mass_models: Annotated[dict[str, dict[str, MassModel]], Field(min_length=1)]
+    deflector: SersicLight | None = None
+    coordinates: tuple[RightAscension, Declination] | None = None
+
+    @model_validator(mode="after")
+    def _names_and_slopes(self) -> LensSystem:
+        names = [image.name for image in self.agn]
+        if len(set(names)) != len(names):
+            raise SpecError("agn", names, "images of different names")
+        for model, by_slope in self.mass_models.items():
+            if not by_slope:
+                raise SpecError(f"mass_models.{model}", by_slope, "a model for one l_eta at least")
+            for key, mass in by_slope.items():
+                if not _is_number(key) or abs(float(key) + 1.0 - mass.slope) > _SLOPE_TOLERANCE:
+                    raise SpecError(
+                        f'mass_models.{model}["{key}"]', key, f"l_eta of its slope, {round(mass.slope - 1.0, 9)}"
+                    )
+        return self
+
+    @property
+    def camera_name(self) -> str:
+        """Name of the camera, whether from the catalogue or the system's own."""
+        return self.camera if isinstance(self.camera, str) else self.camera.name
+
+    def mass_model(self, name: str, l_eta: float) -> MassModel:
+        """The mass model called ``name`` at slope l_eta; a SpecError names what there is."""
+        if name not in self.mass_models:
+            raise SpecError("mass_model", name, f"one of {sorted(self.mass_models)} for {self.name}")
+        by_slope = {float(key): mass for key, mass in self.mass_models[name].items()}
+        for slope, mass in by_slope.items():
+            if abs(slope - l_eta) <= _SLOPE_TOLERANCE:
+                return mass
+        raise SpecError("l_eta", l_eta, f"one of {sorted(by_slope)} for {self.name}/{name}")
+
+
+SystemChoice = Annotated[
+    Annotated[Identifier, Tag(NAME_TAG)] | Annotated[LensSystem, Tag(OBJECT_TAG)], Discriminator(name_or_object)
+]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -194,8 +266,8 @@ class Optics:
     about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis].
     """
 
-    defocus_nm: Annotated[float, Field(ge=-500.0, le=500.0)] = 0.0
-    jitter: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+    defocus_nm: Annotated[Number, Field(ge=-500.0, le=500.0)] = 0.0
+    jitter: Annotated[Number, Field(ge=0.0, le=0.5)] = 0.0
 
 
 NOMINAL_OPTICS = Optics()
@@ -237,13 +309,13 @@ class Realization:
     Equal realizations have equal digests and give the same bits.
     """
 
-    system: Identifier | LensSystem
-    l_eta: Annotated[float, Field(ge=0.2, le=1.8)]
+    system: SystemChoice
+    l_eta: Annotated[Number, Field(ge=0.2, le=1.8)]
     host: Host
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
-    camera: Identifier | Camera | None = None
+    camera: CameraChoice | None = None
     optics: Optics | None = None
     analysis: Analysis = Field(default_factory=Analysis)
 
@@ -270,18 +342,38 @@ class Realization:
 
 
 _REALIZATION = TypeAdapter(Realization)
-
-
-def spec_error(error: ValidationError, prefix: str = "") -> SpecError:
-    """The first complaint of a pydantic validation as a SpecError with field, value and what is allowed."""
-    first = error.errors()[0]
-    field = ".".join([prefix] * bool(prefix) + [str(part) for part in first["loc"]])
-    return SpecError(field or "specification", first.get("input"), first["msg"])
+_SYSTEM = TypeAdapter(LensSystem)
+_CAMERA = TypeAdapter(Camera)
 
 
 def realization_from_dict(document: object) -> Realization:
     """Read a realization from its JSON form; a SpecError names the field that is wrong."""
     try:
         return _REALIZATION.validate_python(document)
+    except ValidationError as error:
+        raise spec_error(error) from error
+
+
+def system_from_mapping(document: Mapping[str, Any]) -> LensSystem:
+    """Read a lens system from its JSON or TOML form; a SpecError names the field that is wrong, as ``agn[1].name``."""
+    return _read(_SYSTEM, document)
+
+
+def camera_from_mapping(document: Mapping[str, Any]) -> Camera:
+    """Read a camera from its JSON or TOML form; a SpecError names the field that is wrong."""
+    return _read(_CAMERA, document)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _read(adapter: TypeAdapter[_Read], document: Mapping[str, Any]) -> _Read:
+    try:
+        return adapter.validate_python(document)
     except ValidationError as error:
         raise spec_error(error) from error

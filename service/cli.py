@@ -14,6 +14,7 @@ from rich.console import Console
 
 from service import VERSION
 from service.client import ApiError, Client
+from service.pictures import COMMANDS, named_or_read
 from service.settings import Settings
 from service.tables import grid_line, runs_table, summary_table
 from service.watch import progress
@@ -26,6 +27,8 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
+for command in COMMANDS:
+    app.command()(command)
 
 Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]
 Floats = Annotated[list[float] | None, typer.Option()]
@@ -117,7 +120,9 @@ def demo(
 @app.command()
 def submit(
     preset: Annotated[str | None, typer.Option(help="As h0licow-vi/HE0435")] = None,
-    system: Annotated[list[str] | None, typer.Option(help="May be repeated, like the values below")] = None,
+    system: Annotated[
+        list[str] | None, typer.Option(help="A name, or a TOML or JSON file; may be repeated, like the values below")
+    ] = None,
     n: Floats = None,
     r_eff: Floats = None,
     magnitude: Floats = None,
@@ -133,8 +138,9 @@ def submit(
     """Submit a grid."""
     request = {} if file is None else json.loads(file.read_text(encoding="utf-8"))
     options = {
-        "preset": preset, "systems": system, "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta,
-        "seed": seed, "replicates": replicates, "name": name,
+        "preset": preset, "systems": [named_or_read(entry) for entry in system or []],
+        "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed,
+        "replicates": replicates, "name": name,
     }  # fmt: skip
     request |= {option: value for option, value in options.items() if value not in (None, [])}
     with _Talk(url) as client:

@@ -13,10 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, cr
 
 from engine import (
     Analysis,
+    CameraChoice,
     Grid,
     GridRun,
     NoiseLevel,
     Optics,
+    SystemChoice,
     camera_names,
     engine_digest,
     expand,
@@ -64,14 +66,16 @@ class GridRequest(BaseModel):
     """A grid of realizations.
 
     With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
-    lists are needed, and every combination is run. ``replicates`` repeats each with seeds seed, seed + 1, ...
+    lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
+    so is ``camera``, which takes the place of the systems' own. ``replicates`` repeats each point with seeds seed,
+    seed + 1, ...
     """
 
     model_config = _CONFIG
 
     name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=_PRINTABLE)] | None = None
     preset: Identifier | None = None
-    systems: Annotated[list[Identifier], _SOME] | None = None
+    systems: Annotated[list[SystemChoice], _SOME] | None = None
     n: Indices | None = None
     r_eff: Radii | None = None
     magnitude: Magnitudes | None = None
@@ -79,6 +83,7 @@ class GridRequest(BaseModel):
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
     optics: Optics | None = None
+    camera: CameraChoice | None = None
     seed: Annotated[int, Strict(), Field(ge=0, le=2**62)] = 0
     replicates: Annotated[int, Strict(), Field(ge=1, le=100_000)] = 1
     analysis: AnalysisBody | None = None
@@ -121,7 +126,7 @@ def _limit(runs: int, allowed: int) -> None:
 
 
 def _grid(request: GridRequest, replicates: int) -> Grid:
-    cuts = {
+    cuts: dict[str, Any] = {
         name: None if getattr(request, name) is None else tuple(getattr(request, name))
         for name in ("systems", "n", "r_eff", "magnitude", "l_eta")
     }
@@ -131,6 +136,7 @@ def _grid(request: GridRequest, replicates: int) -> Grid:
         mass_model=request.mass_model,
         noise_level=request.noise_level,
         optics=request.optics,
+        camera=request.camera,
         seed=request.seed,
         replicates=replicates,
         analysis=Analysis(**changes),
@@ -140,7 +146,8 @@ def _grid(request: GridRequest, replicates: int) -> Grid:
 
 def _planned(run: GridRun) -> PlannedRun:
     realization = run.realization
-    camera = realization.camera or _system_camera(realization.system_name)
+    system = realization.system
+    camera = realization.camera or (load_system(system) if isinstance(system, str) else system).camera
     inputs = {
         "system": realization.system_name,
         "camera": camera if isinstance(camera, str) else camera.name,
@@ -154,10 +161,6 @@ def _planned(run: GridRun) -> PlannedRun:
         "seed": realization.seed,
     }
     return PlannedRun(run.label, run.paper_run, realization.to_dict(), inputs, realization.digest)
-
-
-def _system_camera(name: str) -> str:
-    return load_system(name).camera
 
 
 def list_systems() -> list[SystemItem]:
@@ -174,7 +177,7 @@ def _system_fields(name: str) -> dict[str, Any]:
     system = load_system(name)
     return {
         "name": name,
-        "camera": system.camera,
+        "camera": system.camera_name,
         "mass_models": {model: sorted(map(float, slopes)) for model, slopes in system.mass_models.items()},
         "links": {"self": f"/v1/systems/{name}"},
     }

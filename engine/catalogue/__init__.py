@@ -14,7 +14,8 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from engine.errors import SpecError
-from engine.spec import Camera, Dither, LensSystem, spec_error
+from engine.spec import Camera, Dither, LensSystem
+from engine.validation import spec_error
 
 _SYSTEM = TypeAdapter(LensSystem)
 _CAMERA = TypeAdapter(Camera)
@@ -67,6 +68,7 @@ def load_system(name: str) -> LensSystem:
         "exposures": _pick(facts["exposures"], "field_pixels", "dither", "long_s", "n_long", "short_s"),
         "agn": [{"name": label, **image} for label, image in facts["agn"]["images"].items()],
         "deflector": _pick(facts["deflector"], *light),
+        "coordinates": facts["coordinates"]["degrees"],
         "host_q": facts["host_shape"]["q"],
         "host_position_angle": facts["host_shape"]["position_angle"],
         "mass_models": {

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,34 +18,35 @@ from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
 from engine.imaging.response import PointResponse
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+_KEYWORD = re.compile(r"[A-Z][A-Z0-9_-]{0,7}")
+_RESERVED = {"SIMPLE", "BITPIX", "NAXIS", "EXTEND", "END", "CONTINUE", "COMMENT", "HISTORY", "CHECKSUM", "DATASUM"}
+_CARD_TEXT = 68
 
 
-def write_observation(
-    path: str | Path,
-    observation: Observation,
-    *,
-    centre: tuple[float, float] | None = None,
-    overwrite: bool = False,
-) -> None:
+def write_observation(path: str | Path, observation: Observation, *, overwrite: bool = False) -> None:
     """Write an Observation: extensions IMAGE, NOISE, PSF, VALID and, where it has them, COVARIANCE and EXPOSURES.
 
-    Parameters
-    ----------
-    centre
-        (RA, Dec) [deg, ICRS] of the centre of the image. With it the image and its maps carry a tangential
-        projection, North up and East left; without it a linear system in arcsec from the centre, x increasing
-        with the columns.
+    The image and its maps carry a tangential projection, North up and East left, where the observation knows its
+    ``centre``, and otherwise a linear system in arcsec from the centre, x increasing with the columns. The provenance
+    stands in the primary header: as JSON text in PKEYn and PVALn, which keeps every digit and the type, and for people
+    also under its own name where that is a FITS keyword and the value fits on a card.
     """
     primary = fits.PrimaryHDU()
-    primary.header["HOSTLENS"] = (FORMAT_VERSION, "version of this layout")
-    primary.header["PIXSCALE"] = (observation.pixel_scale, "[arcsec] side of a pixel")
-    primary.header["ZEROPNT"] = (observation.zero_point, "[mag] AB magnitude of 1 electron/s")
+    header = primary.header
+    header["LONGSTRN"] = ("OGIP 1.0", "long text goes on in CONTINUE cards")
+    header["HOSTLENS"] = (FORMAT_VERSION, "version of this layout")
+    header["PIXSCALE"] = (observation.pixel_scale, "[arcsec] side of a pixel")
+    header["ZEROPNT"] = (observation.zero_point, "[mag] AB magnitude of 1 electron/s")
+    exact = {"pixel_scale": observation.pixel_scale, "zero_point": observation.zero_point, "centre": observation.centre}
+    header["EXACT"] = json.dumps(exact)
+    for key, value in observation.provenance.items():
+        if _KEYWORD.fullmatch(key) and key not in header and key not in _RESERVED and _fits_on_a_card(value):
+            header[key] = value
     for index, (key, value) in enumerate(observation.provenance.items()):
-        # JSON text keeps every digit and the type, which a FITS number does not.
-        primary.header[f"PKEY{index}"] = (key, "provenance: name")
-        primary.header[f"PVAL{index}"] = json.dumps(value)
-    world = _world_coordinates(observation, centre)
+        header[f"PKEY{index}"] = json.dumps(key)
+        header[f"PVAL{index}"] = json.dumps(value)
+    world = _world_coordinates(observation)
     planes: list[Any] = [
         fits.ImageHDU(observation.image, world, name="IMAGE"),
         fits.ImageHDU(observation.noise, world, name="NOISE"),
@@ -59,8 +62,15 @@ def write_observation(
     fits.HDUList([primary, *planes]).writeto(path, overwrite=overwrite, checksum=True)
 
 
-def _world_coordinates(observation: Observation, centre: tuple[float, float] | None) -> fits.Header:
+def _fits_on_a_card(value: str | float | int) -> bool:
+    if isinstance(value, str):
+        return value.isascii() and value.isprintable() and len(value.replace("'", "''")) <= _CARD_TEXT
+    return math.isfinite(value) and abs(value) < 2**63
+
+
+def _world_coordinates(observation: Observation) -> fits.Header:
     ny, nx = observation.shape
+    centre = observation.centre
     header = fits.Header()
     for axis, n in ((1, nx), (2, ny)):
         header[f"CRPIX{axis}"] = (n + 1) / 2  # FITS counts pixels from 1
@@ -100,6 +110,7 @@ def _covariance_table(covariance: sparse.csr_matrix) -> fits.BinTableHDU:
 def _exposures(response: PointResponse) -> fits.ImageHDU:
     """The optical PSF on sub-pixels, with sampling and detector kernel as JSON text in its header."""
     plane = fits.ImageHDU(response.psf, name="EXPOSURES")
+    plane.header["LONGSTRN"] = "OGIP 1.0"
     plane.header["SAMPLING"] = json.dumps(asdict(response.geometry))
     plane.header["DETECTOR"] = json.dumps(response.detector_kernel.tolist())
     return plane
@@ -141,10 +152,11 @@ def _observation(hdus: fits.HDUList) -> Observation:
     header = hdus[0].header
     if header["HOSTLENS"] != FORMAT_VERSION:
         raise ObservationError(f"HOSTLENS: got layout {header['HOSTLENS']}, allowed is {FORMAT_VERSION}")
+    exact = json.loads(header["EXACT"])
     provenance: dict[str, str | float | int] = {}
     while f"PKEY{len(provenance)}" in header:
         index = len(provenance)
-        provenance[header[f"PKEY{index}"]] = json.loads(header[f"PVAL{index}"])
+        provenance[json.loads(header[f"PKEY{index}"])] = json.loads(header[f"PVAL{index}"])
     image, noise, psf = (hdus[name].data.astype(np.float64) for name in ("IMAGE", "NOISE", "PSF"))
     covariance = None
     if "COVARIANCE" in hdus:
@@ -156,24 +168,11 @@ def _observation(hdus: fits.HDUList) -> Observation:
         image,
         noise,
         psf,
-        header["PIXSCALE"],
-        header["ZEROPNT"],
+        exact["pixel_scale"],
+        exact["zero_point"],
         covariance=covariance,
         valid=hdus["VALID"].data.astype(bool),
         provenance=provenance,
         response=_response(hdus["EXPOSURES"]) if "EXPOSURES" in hdus else None,
+        centre=None if exact["centre"] is None else (exact["centre"][0], exact["centre"][1]),
     )
-
-
-def read_image(path: str | Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Read the first two-dimensional image in a FITS file of anybody's, as float64 in native byte order."""
-    try:
-        with fits.open(path, memmap=False) as hdus:
-            for hdu in hdus:
-                if getattr(hdu, "is_image", False) and hdu.data is not None and hdu.data.ndim == 2:
-                    return np.asarray(hdu.data, dtype=np.float64)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise ObservationError(f"{path}: not a FITS file ({error})") from error
-    raise ObservationError(f"{path}: holds no two-dimensional image")

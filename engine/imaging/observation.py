@@ -44,6 +44,8 @@ class Observation:
         Where it comes from: names to text or numbers.
     response
         The exposures behind the image, where they are known: point sources are then exact, not shifted stamps.
+    centre
+        (RA, Dec) [deg, ICRS] of the middle of the image, where it is known.
     """
 
     image: FloatArray
@@ -55,11 +57,12 @@ class Observation:
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]  # never None after __post_init__
     provenance: Provenance = field(default_factory=dict)
     response: PointResponse | None = None
+    centre: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Copy, freeze and check; an ObservationError names what is wrong."""
         for name in ("image", "noise", "psf"):
-            object.__setattr__(self, name, _frozen(name, getattr(self, name)))
+            object.__setattr__(self, name, image_array(name, getattr(self, name)))
         valid = np.ones(self.image.shape, dtype=bool) if self.valid is None else np.array(self.valid)
         if valid.dtype != bool:
             raise ObservationError(f"valid: got an array of {valid.dtype}, allowed is bool")
@@ -78,6 +81,13 @@ class Observation:
                 raise ObservationError(f"provenance {key!r}: got {entry!r}, allowed are text and numbers")
         if self.covariance is not None:
             self._check_covariance(valid)
+        if self.centre is not None:
+            ra, dec = (float(angle) for angle in self.centre)
+            if not (0.0 <= ra < 360.0 and -90.0 <= dec <= 90.0):
+                raise ObservationError(
+                    f"centre: got {self.centre}, allowed are RA in [0, 360) and Dec in [-90, 90] deg"
+                )
+            object.__setattr__(self, "centre", (ra, dec))
 
     def _check_image(self, valid: NDArray[np.bool_]) -> None:
         for name, array in (("noise", self.noise), ("valid", valid)):
@@ -122,7 +132,8 @@ class Observation:
         return place_stamp(self.psf, self.shape, column, row)
 
 
-def _frozen(name: str, values: ArrayLike) -> FloatArray:
+def image_array(name: str, values: ArrayLike) -> FloatArray:
+    """A read-only two-dimensional float64 copy; an ObservationError names what could not be one."""
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -140,76 +151,3 @@ def _check_psf(psf: FloatArray) -> None:
         raise ObservationError("psf: not finite everywhere")
     if not psf.sum() > 0:
         raise ObservationError(f"psf: got the sum {psf.sum()}, allowed is a positive one")
-
-
-def observation_from_arrays(
-    image: ArrayLike,
-    noise: ArrayLike,
-    psf: ArrayLike,
-    pixel_scale: float,
-    zero_point: float,
-    *,
-    recentre_psf: bool = False,
-    normalise_psf: bool = False,
-    valid: NDArray[np.bool_] | None = None,
-    provenance: Provenance | None = None,
-) -> Observation:
-    """Make an Observation from arrays that somebody else made.
-
-    Pixels whose noise is zero, negative, NaN or infinite, or whose image is not finite, become invalid (and
-    hold 0 in the image and infinity in the noise map); the provenance records how many, and what was done to
-    the PSF. The PSF is changed on request alone.
-
-    Parameters
-    ----------
-    image, noise
-        (ny, nx) [e-/s], 1 sigma.
-    psf
-        PSF on the image's pixels.
-    recentre_psf
-        Cut or pad the PSF with zeros to the odd square about its brightest pixel that loses nothing.
-    normalise_psf
-        Divide the PSF by its sum.
-    valid
-        Pixels that may be used, in addition to the rule above.
-
-    Raises
-    ------
-    ObservationError
-        For shapes that do not fit, a PSF that is not an odd square, and all that Observation refuses.
-    """
-    pixels, sigma, stamp = (
-        np.array(_frozen(name, values)) for name, values in (("image", image), ("noise", noise), ("psf", psf))
-    )
-    if sigma.shape != pixels.shape:
-        raise ObservationError(f"noise: got shape {sigma.shape}, allowed is the image's {pixels.shape}")
-    usable = np.isfinite(pixels) & np.isfinite(sigma) & (sigma > 0)
-    if valid is not None and np.shape(valid) != pixels.shape:
-        raise ObservationError(f"valid: got shape {np.shape(valid)}, allowed is the image's {pixels.shape}")
-    record: dict[str, str | float | int] = dict(provenance or {})
-    if not usable.all():
-        record["unusable_pixels"] = int(np.count_nonzero(~usable))
-    pixels[~usable], sigma[~usable] = 0.0, np.inf
-    if recentre_psf:
-        stamp, peak = _recentred(stamp)
-        record["psf_peak_was_at_row"], record["psf_peak_was_at_column"] = peak
-    if normalise_psf:
-        total = float(stamp.sum())
-        if not (np.isfinite(total) and total > 0):
-            raise ObservationError(f"psf: got the sum {total}, allowed is a positive one")
-        record["psf_divided_by"] = total
-        stamp = stamp / total
-    allowed = usable if valid is None else usable & np.asarray(valid, dtype=bool)
-    return Observation(pixels, sigma, stamp, pixel_scale, zero_point, valid=allowed, provenance=record)
-
-
-def _recentred(psf: FloatArray) -> tuple[FloatArray, tuple[int, int]]:
-    """Put the PSF on the smallest odd square centred on its peak that holds it; say where that was."""
-    if not np.isfinite(psf).all():
-        raise ObservationError("psf: not finite everywhere, so it has no peak to be centred on")
-    row, column = (int(index) for index in np.unravel_index(np.argmax(psf), psf.shape))
-    ny, nx = psf.shape
-    half = max(row, ny - 1 - row, column, nx - 1 - column)
-    centred = np.zeros((2 * half + 1, 2 * half + 1))
-    centred[half - row : half - row + ny, half - column : half - column + nx] = psf
-    return centred, (row, column)

@@ -100,7 +100,8 @@ def pupil_transmission(pupil: Pupil, n: int, *, supersampling: int = 3) -> Float
     # A straight edge crosses the rows of points at one angle; softened over this width, they add up right.
     angle = math.radians(pupil.rotation_deg)
     width = point * (abs(math.cos(angle)) + abs(math.sin(angle)))
-    for across in (x, y):
+    # Without vanes there is none, not one of no width, whose softened edge would still cast a shadow.
+    for across in (x, y) if vane > 0 else ():
         open_ *= _step((np.abs(across) - vane / 2) / width)
     for pad_x, pad_y, radius in pupil.pads:
         open_ *= _step((np.hypot(x - pad_x, y - pad_y) - radius) / point)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from http import HTTPStatus
 from typing import Any, Literal
 
@@ -14,12 +15,14 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.exceptions import HTTPException
 
-from engine import SpecError, spec_error
+from engine import SpecError, field_steps, spec_error
 from service.requests import TooManyRunsError
 from service.schemas import Place, Problem
 from service.store.grids import KeyReusedError, NotFoundError
 
 MEDIA_TYPE = "application/problem+json"
+# A step of a field's path as the engine writes it: name, [index] or ["key"].
+_STEP = re.compile(r'\["([^"]*)"\]|\[(\d+)\]|([^.\[\]]+)')
 _LOG = logging.getLogger(__name__)
 _SOURCES: dict[str, Literal["body", "query", "path", "header"]] = {
     "body": "body",
@@ -83,7 +86,7 @@ def _pointer(parts: tuple[Any, ...]) -> str:
 
 
 def _place(error: dict[str, Any]) -> Place:
-    source, *rest = error["loc"] or ("body",)
+    source, *rest = field_steps(error["loc"]) or ("body",)
     where = _SOURCES.get(str(source), "body")
     pointer = _pointer(tuple(rest)) if where == "body" else _printable(".".join(map(str, rest)))
     return Place.model_validate({"in": where, "pointer": pointer, "message": _printable(error["msg"])})
@@ -100,9 +103,9 @@ def _invalid_place(request: Request, error: Exception) -> JSONResponse:
 
 
 def _bad_spec(request: Request, error: Exception) -> JSONResponse:
-    field = str(getattr(error, "field", ""))
-    pointer = "/" + field.replace(".", "/")
-    place = Place.model_validate({"in": "body", "pointer": _printable(pointer), "message": _printable(str(error))})
+    steps = _STEP.findall(str(getattr(error, "field", "")))
+    pointer = _pointer(tuple("".join(step) for step in steps))
+    place = Place.model_validate({"in": "body", "pointer": pointer, "message": _printable(str(error))})
     return problem(request, 422, str(error), [place])
 
 

@@ -131,7 +131,7 @@ def test_a_realization_survives_json_and_keeps_its_digest() -> None:
         ({"seed": -1}, "seed"),
         ({"noise_level": "none"}, "noise_level"),
         ({"unheard_of": 1}, "unheard_of"),
-        ({"analysis": {"source_pixels": [1, 30]}}, "analysis.source_pixels.0"),
+        ({"analysis": {"source_pixels": [1, 30]}}, "analysis.source_pixels[0]"),
     ],
 )
 def test_a_bad_realization_is_refused_by_field(change: dict[str, object], field: str) -> None:

@@ -9,7 +9,8 @@ from engine.catalogue import load_camera, load_dither
 from engine.conventions import FloatArray
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.psf import detector_kernel, telescope_psf
-from engine.spec import Camera
+from engine.simulation import Simulation, simulate_realization
+from engine.spec import Camera, Host, Realization
 
 SHARED_DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 
@@ -49,6 +50,13 @@ def setup(request: pytest.FixtureRequest) -> Setup:
 @pytest.fixture(scope="session")
 def f160w() -> Setup:
     return make_setup("F160W")
+
+
+@pytest.fixture(scope="session")
+def simulated() -> Simulation:
+    """A realization of HE0435 with all its provenance."""
+    host = Host(n=2.0, r_eff=0.39, magnitude=21.0)
+    return simulate_realization(Realization(system="HE0435", l_eta=1.0, host=host, seed=3))
 
 
 @pytest.fixture(scope="session")

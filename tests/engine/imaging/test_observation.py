@@ -3,7 +3,7 @@ import pytest
 from scipy import sparse
 
 from engine.errors import ObservationError
-from engine.imaging.observation import Observation, observation_from_arrays
+from engine.imaging.observation import Observation
 
 
 def parts(**changes):
@@ -74,39 +74,7 @@ def test_one_pixel_and_a_psf_larger_than_the_image_are_allowed():
     Observation(**parts(image=np.ones((1, 1)), noise=np.ones((1, 1)), psf=np.ones((9, 9))))
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
-def test_unusable_noise_makes_pixels_invalid_in_foreign_data(value):
-    observation = observation_from_arrays(**parts(noise=holed(value)))
-    assert not observation.valid[1, 2]
-    assert observation.valid.sum() == 11
-    assert observation.provenance["unusable_pixels"] == 1
-
-
-def test_foreign_psf_is_changed_on_request_alone_and_says_so():
-    psf = np.full((8, 6), 0.1)
-    psf[3, 4] = 2.0
-    with pytest.raises(ObservationError, match="odd square"):
-        observation_from_arrays(**parts(psf=psf))
-    observation = observation_from_arrays(**parts(psf=psf), recentre_psf=True)
-    assert observation.psf.shape == (9, 9)
-    assert observation.psf[4, 4] == 2.0
-    assert observation.psf.sum() == pytest.approx(psf.sum())
-    assert observation.provenance["psf_peak_was_at_row"] == 3
-    assert observation.provenance["psf_peak_was_at_column"] == 4
-    observation = observation_from_arrays(**parts(psf=psf), recentre_psf=True, normalise_psf=True)
-    assert observation.psf.sum() == pytest.approx(1, abs=1e-15)
-    assert observation.provenance["psf_divided_by"] == pytest.approx(psf.sum())
-
-
-def test_foreign_mask_and_shapes_are_checked():
-    valid = np.ones((3, 4), dtype=bool)
-    valid[0] = False
-    assert observation_from_arrays(**parts(noise=holed(0.0)), valid=valid).valid.sum() == 7
-    with pytest.raises(ObservationError, match="valid"):
-        observation_from_arrays(**parts(), valid=valid[:2])
-    with pytest.raises(ObservationError, match="noise: got shape"):
-        observation_from_arrays(**parts(noise=np.ones((4, 4))))
-    with pytest.raises(ObservationError, match="no pixel"):
-        observation_from_arrays(**parts(noise=np.zeros((3, 4))))
-    with pytest.raises(ObservationError, match="psf"):
-        observation_from_arrays(**parts(psf=np.full((3, 3), np.nan)), recentre_psf=True)
+@pytest.mark.parametrize("centre", [(360.0, 0.0), (10.0, 91.0), (np.nan, 0.0)])
+def test_a_centre_that_is_not_on_the_sky_is_refused(centre):
+    with pytest.raises(ObservationError, match="centre"):
+        Observation(**parts(), centre=centre)

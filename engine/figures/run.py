@@ -1,4 +1,4 @@
-"""Figures of a run. Not a numeric module: it turns a result's arrays into pictures and computes nothing."""
+"""The figure of a run: observation, model, residual; source, truth, uncertainty."""
 
 from __future__ import annotations
 
