@@ -186,6 +186,27 @@ def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
         typer.echo(grid_line(client.cancel(grid)))
 
 
+@app.command()
+def pause(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Start no further run of a grid for now; running ones go on to their end."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.pause(grid)))
+
+
+@app.command()
+def resume(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Go on with a paused grid."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.resume(grid)))
+
+
+@app.command()
+def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Queue again what failed, was quarantined or was cancelled."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.retry(grid)))
+
+
 @database.command("upgrade")
 def db_upgrade() -> None:
     """Bring the database to the newest schema."""

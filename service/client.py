@@ -93,6 +93,18 @@ class Client:
         """Cancel a grid."""
         return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/cancel"))
 
+    def pause(self, grid_id: str) -> GridView:
+        """Start no further run of a grid for now."""
+        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/pause"))
+
+    def resume(self, grid_id: str) -> GridView:
+        """Go on with a paused grid."""
+        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/resume"))
+
+    def retry(self, grid_id: str) -> GridView:
+        """Queue again what failed, was quarantined or was cancelled."""
+        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/retry"))
+
     def readiness(self) -> Readiness:
         """Whether the service can compute."""
         return Readiness.model_validate(self._call("GET", "/readyz"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
@@ -156,7 +157,8 @@ def _end_group(process: subprocess.Popen[bytes]) -> None:
 def _as_environment(settings: Settings) -> dict[str, str]:
     """The settings as the variables that the children read, so that all agree whatever came from the command line."""
     values = settings.model_dump(mode="json", exclude_none=True)
-    return {f"HOSTLENS_{name.upper()}": str(value) for name, value in values.items()}
+    plain = {name: json.dumps(value) if isinstance(value, list) else str(value) for name, value in values.items()}
+    return {f"HOSTLENS_{name.upper()}": value for name, value in plain.items()}
 
 
 def require_free(settings: Settings) -> None:

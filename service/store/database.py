@@ -19,10 +19,11 @@ class Database:
 
     On SQLite ``write`` begins IMMEDIATE: a transaction that reads first and then wants to write fails at once when
     another writer was there in between, whatever the busy timeout; one that waits for its turn at the beginning
-    does not. ``read`` stays deferred, so that readers never wait (the journal is a WAL).
+    does not. ``read`` stays deferred, so that readers never wait (the journal is a WAL). ``foreign_keys`` is only ever
+    turned off by migrations, which replace tables that others refer to.
     """
 
-    def __init__(self, url: str, *, pooled: bool = True) -> None:
+    def __init__(self, url: str, *, pooled: bool = True, foreign_keys: bool = True) -> None:
         self.url = make_url(url)
         if self.url.drivername in {"postgresql", "postgres"}:
             self.url = self.url.set(drivername="postgresql+psycopg")
@@ -34,6 +35,8 @@ class Database:
         self.engine: Engine = create_engine(self.url, **options)
         if self.is_sqlite:
             event.listen(self.engine, "connect", _prepare_sqlite)
+            if foreign_keys:
+                event.listen(self.engine, "connect", _enforce_foreign_keys)
             event.listen(self.engine, "begin", _begin_sqlite)
         self._writer = self.engine.execution_options(hostlens_write=True)
 
@@ -67,6 +70,11 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
     cursor.execute("PRAGMA journal_mode = WAL")
     # FULL, not NORMAL: an accepted grid (202) must survive a power failure, not only a crash of the process.
     cursor.execute("PRAGMA synchronous = FULL")
+    cursor.close()
+
+
+def _enforce_foreign_keys(connection: Any, _record: Any) -> None:
+    cursor = connection.cursor()
     cursor.execute("PRAGMA foreign_keys = ON")
     cursor.close()
 

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import (
     JSON,
     BigInteger,
+    Boolean,
     CheckConstraint,
     Column,
     DateTime,
@@ -22,6 +23,7 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    false,
     text,
 )
 from sqlalchemy.types import TypeEngine
@@ -75,7 +77,17 @@ grid = Table(
     Column("created_at", UtcDateTime, nullable=False),
     Column("finished_at", UtcDateTime),
     Column("cancelled_at", UtcDateTime),
+    Column("paused_at", UtcDateTime),
+    # Whose results are taken; null in grids that are older than this column, which take any engine's.
+    Column("engine_digest", String(64)),
     CheckConstraint("state in ('queued', 'done', 'failed', 'cancelled')", name="state"),
+)
+# The grids that are not finished: few, however many have ended.
+Index(
+    "ix_grid_open",
+    grid.c.engine_digest,
+    sqlite_where=text("state = 'queued'"),
+    postgresql_where=text("state = 'queued'"),
 )
 
 run = Table(
@@ -99,10 +111,12 @@ run = Table(
     Column("finished_at", UtcDateTime),
     Column("error_code", String(64)),
     Column("error_detail", Text),
+    # It may have killed a worker: from now on it runs alone.
+    Column("suspect", Boolean, nullable=False, server_default=false()),
     UniqueConstraint("grid_id", "ordinal"),
     UniqueConstraint("grid_id", "digest"),
     CheckConstraint(
-        "state in ('queued', 'leased', 'done', 'failed', 'quarantined', 'cancelled')",
+        "state in ('queued', 'paused', 'leased', 'done', 'failed', 'quarantined', 'cancelled')",
         name="state",
     ),
     # A lease is a state with a token, never the one without the other.
@@ -117,6 +131,14 @@ Index(
     run.c.id,
     sqlite_where=text("state = 'queued'"),
     postgresql_where=text("state = 'queued'"),
+)
+# The suspect lane, which is nearly always empty: a look into it must not go through the queue.
+Index(
+    "ix_run_suspect",
+    run.c.not_before,
+    run.c.id,
+    sqlite_where=text("state = 'queued' and suspect = 1"),
+    postgresql_where=text("state = 'queued' and suspect"),
 )
 Index(
     "ix_run_leased",
@@ -237,6 +259,7 @@ leader = Table(
     Column("generation", BigInteger, nullable=False),
     Column("holder", String(200), nullable=False),
     Column("workers", Integer, nullable=False),
+    Column("engines", JSON, nullable=False, server_default=text("'{}'")),
     Column("beat_at", UtcDateTime, nullable=False),
     Column("expires_at", UtcDateTime, nullable=False),
     CheckConstraint("id = 1", name="single_row"),

@@ -30,7 +30,7 @@ RUN_COLUMNS = tuple(
     run.c[name]
     for name in (
         "id", "grid_id", "ordinal", "label", "paper_run", "state", "inputs",
-        "attempt", "error_code", "error_detail", "finished_at",
+        "attempt", "suspect", "error_code", "error_detail", "finished_at",
     )
 )  # fmt: skip
 
@@ -45,13 +45,17 @@ class Recent:
 
 
 def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
-    """A grid with its progress; an unfinished one is running as soon as a run has been started."""
+    """A grid with its progress; an unfinished one that is not paused is running once a run has been started."""
     runs = RunCounts(**counts)
     state = GridState(row.state)
-    if state is GridState.QUEUED and (runs.leased or runs.ended):
+    if state is GridState.QUEUED and row.paused_at is not None:
+        state = GridState.PAUSED
+    elif state is GridState.QUEUED and (runs.leased or runs.ended):
         state = GridState.RUNNING
-    remaining = runs.queued + runs.leased
+    remaining = runs.queued + runs.paused + runs.leased
     rate, left = _pace(recent, remaining, now)
+    if state is GridState.PAUSED:
+        left = None
     return GridView(
         id=row.id,
         name=row.name,
@@ -65,12 +69,14 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
         created_at=row.created_at,
         finished_at=row.finished_at,
         cancelled_at=row.cancelled_at,
+        paused_at=row.paused_at,
+        engine_digest=row.engine_digest,
         request=row.request,
         links={
             "self": f"/v1/grids/{row.id}",
             "runs": f"/v1/grids/{row.id}/runs",
             "summary": f"/v1/grids/{row.id}/summary",
-            "cancel": f"/v1/grids/{row.id}/cancel",
+            **{action: f"/v1/grids/{row.id}/{action}" for action in ("cancel", "pause", "resume", "retry")},
         },
     )
 
@@ -142,7 +148,7 @@ def result_view(row: Row[Any]) -> ResultView:
 def _run_fields(row: Row[Any]) -> dict[str, Any]:
     state = RunState(row.state)
     error = None if row.error_code is None else RunError(code=row.error_code, detail=row.error_detail)
-    plain = ("id", "grid_id", "ordinal", "label", "paper_run", "inputs", "attempt", "finished_at")
+    plain = ("id", "grid_id", "ordinal", "label", "paper_run", "inputs", "attempt", "suspect", "finished_at")
     return {
         **{name: getattr(row, name) for name in plain},
         "state": state,

@@ -130,7 +130,7 @@ class Queue(RuleBasedStateMachine):
     @rule(seconds=st.floats(0.1, 20.0))
     def time_passes(self, seconds: float) -> None:
         self.clock.advance(seconds)
-        assert self.leadership.beat(self.generation, 2)
+        assert self.leadership.beat(self.generation, {"e": 2})
 
     @rule(grid_id=grids)
     def cancel(self, grid_id: str) -> None:
