@@ -18,6 +18,10 @@ from service.settings import Settings
 ONE_THREAD = {f"{name}_NUM_THREADS": 1 for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")}
 """Environment of a worker: the queue keeps its cores busy, and threads below a run would only fight for them."""
 
+_OUR_RULES = {
+    "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+    "DASK_DISTRIBUTED__SCHEDULER__WORK_STEALING": "false",
+}
 _CONNECT_S = 15
 _STOP_S = 5.0
 
@@ -93,8 +97,11 @@ def _local(settings: Settings) -> Any:
     )
 
 
-def slurm(settings: Settings) -> Any:
-    """Workers as Slurm jobs, one thread each; ModuleNotFoundError without the extra ``slurm``."""
+def slurm(settings: Settings, *, submit: bool = True) -> Any:
+    """Workers as Slurm jobs, one thread each; ModuleNotFoundError without the extra ``slurm``.
+
+    Without ``submit`` no job is started, and ``job_script()`` shows what it would be.
+    """
     from dask_jobqueue.slurm import SLURMCluster  # noqa: PLC0415 - an extra
 
     cluster = SLURMCluster(
@@ -111,7 +118,8 @@ def slurm(settings: Settings) -> Any:
         worker_extra_args=["--nanny", "--death-timeout", "120"],
         scheduler_options={"dashboard": False},
     )
-    cluster.scale(settings.workers)
+    if submit:
+        cluster.scale(settings.workers)
     return cluster
 
 
@@ -127,7 +135,7 @@ def kubernetes_spec(settings: Settings) -> dict[str, Any]:
             "requests": {"cpu": "1", "memory": settings.kubernetes_memory},
             "limits": {"memory": settings.kubernetes_memory},
         },
-        env={name: str(value) for name, value in ONE_THREAD.items()},
+        env={name: str(value) for name, value in ONE_THREAD.items()} | _OUR_RULES,
         worker_command="dask worker",
     )
     worker = spec["spec"]["worker"]["spec"]["containers"][0]
