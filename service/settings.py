@@ -70,7 +70,9 @@ class Settings(BaseSettings):
     kubernetes_image: str = "hostlens:latest"
     kubernetes_memory: str = "4Gi"
     window: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """Runs in flight at most; one per worker thread where None."""
+    """Runs in flight at most; one per worker thread, or ``batch`` of them, where None."""
+    batch: Annotated[int, Field(ge=1, le=1000)] = 1
+    """Runs that a worker thread is given at a time: more than one where runs take less than about a second."""
     worker_memory: str = "auto"
     """Memory of a worker of the local cluster, as ``2GiB``; beyond it the worker is ended."""
     worker_lifetime_s: Seconds | None = None

@@ -13,6 +13,7 @@ import os
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -29,11 +30,19 @@ _FIRST_COLD = "parametric"
 """Stage of the engine before which a warm-up ends: nearly all that is slow the first time is in the one before."""
 
 
+def call_tasks(task: str, specs: Sequence[dict[str, Any]], artefact_url: str) -> list[dict[str, Any]]:
+    """Run the task for one specification after the other; their answers in the same order.
+
+    The dispatcher submits this function, so that it need not import the engine itself. Short runs come several at a
+    time: what Dask does for each task would take longer than they do.
+    """
+    return [call_task(task, spec, artefact_url) for spec in specs]
+
+
 def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     """Run the task called ``module:function`` and answer ``{"payload": ...}`` or ``{"error": ...}``.
 
-    A payload comes with the digest of the engine that this process has loaded. The dispatcher submits this function,
-    so that it need not import the engine itself.
+    A payload comes with the digest of the engine that this process has loaded.
     """
     try:
         module, _, name = task.partition(":")

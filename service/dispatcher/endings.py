@@ -22,6 +22,13 @@ class OtherEngine:
     digest: str
 
 
+def read_part(lease: Lease, answers: Any, place: int) -> ResultPayload | Failure | OtherEngine:
+    """What a worker's answers to several runs mean for one of them."""
+    if not isinstance(answers, list) or place >= len(answers):
+        return _invalid("the worker did not answer for every run that it was given")
+    return read_answer(lease, answers[place])
+
+
 def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEngine:
     """What a worker's answer means for the run."""
     if not isinstance(answer, dict) or not {"payload", "error"} & set(answer):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 import queue as queues
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +18,7 @@ from distributed import KilledWorker
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
 from service.dispatcher.attribution import Deaths
-from service.dispatcher.endings import OtherEngine, overdue, read_answer, read_exception, unstorable, worker_lost
+from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, unstorable, worker_lost
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.placement import Slots
 from service.dispatcher.pool import Pool, Worker, is_lost
@@ -37,11 +38,13 @@ _NO_WINDOW = 1_000_000
 
 @dataclass
 class Flight:
-    """A run on a worker."""
+    """A run on a worker: at ``place`` of the answers of a Dask task, where ``beside`` others are too."""
 
     lease: Lease
     worker: str
     future: Any
+    place: int
+    beside: int
     started: float
     missed: float | None = None
     """Since when its worker has been gone."""
@@ -151,7 +154,8 @@ class Dispatcher:
             self._fill_lane(engine, mine)
             free = self._slots.free(mine)[: self._room()]
             if free and self._queue.waiting(engine):
-                self._place(self._queue.claim(self._generation, len(free), engine), free)
+                wanted = min(len(free) * self._settings.batch, self._room())
+                self._place(self._queue.claim(self._generation, wanted, engine), free)
 
     def _fill_lane(self, engine: str, workers: list[Worker]) -> None:
         """Give the next suspect a worker of its own."""
@@ -172,46 +176,68 @@ class Dispatcher:
         return max((window or _NO_WINDOW) - len(self._flights), 0)
 
     def _place(self, leases: list[Lease], workers: list[Worker]) -> None:
-        for lease, worker in zip(leases, workers, strict=False):
-            key = lease.key
-            self._slots.take(worker.address, key, alone=lease.suspect)
-            future = self._pool.submit(lease, worker, lambda _, key=key: self._done.put(key))  # type: ignore[misc]
-            self._flights[key] = Flight(lease, worker.address, future, time.monotonic())
+        """Give each worker its part of the runs, as one task."""
+        size = math.ceil(len(leases) / len(workers))
+        for start, worker in zip(range(0, len(leases), max(size, 1)), workers, strict=False):
+            batch = leases[start : start + size]
+            self._slots.take(worker.address, batch[0].key, alone=batch[0].suspect)
+            future = self._pool.submit(batch, worker)
+            now = time.monotonic()
+            for place, lease in enumerate(batch):
+                self._flights[lease.key] = Flight(lease, worker.address, future, place, len(batch) - 1, now)
+            future.add_done_callback(lambda done: self._done.put(done.key))
 
     def _remove(self, key: str) -> Flight:
         flight = self._flights.pop(key)
-        self._slots.release(flight.worker, key)
+        self._slots.release(flight.worker, flight.future.key)
         return flight
 
     def _collect(self, wait_s: float) -> None:
-        """Turn runs that Dask has ended into endings, waiting for the first of them."""
+        """Turn runs that Dask has ended into endings, waiting for the first of them; results make one ending."""
+        results: list[tuple[Lease, ResultPayload]] = []
         try:
-            self._land(self._done.get(timeout=wait_s))
+            self._land(self._done.get(timeout=wait_s), results)
             while True:
-                self._land(self._done.get_nowait())
+                self._land(self._done.get_nowait(), results)
         except queues.Empty:
-            return
+            if results:
+                self._endings.append(partial(self._store, results))
 
-    def _land(self, key: str) -> None:
-        flight = self._flights.get(key)
-        if flight is None or is_lost(flight.future):
+    def _land(self, task: str, results: list[tuple[Lease, ResultPayload]]) -> None:
+        """End the runs of a Dask task; what there is to store comes to ``results``."""
+        flights = [flight for flight in self._flights.values() if flight.future.key == task]
+        if not flights or is_lost(flights[0].future):
             return  # stopped by us, or for the reconciliation to look at
-        lease = flight.lease
-        ending: ResultPayload | Failure | OtherEngine
-        if flight.future.status == "error":
-            error = flight.future.exception(timeout=_GATHER_S)
+        future, answers = flights[0].future, None
+        error: BaseException | None = None
+        if future.status == "error":
+            error = future.exception(timeout=_GATHER_S)
             if isinstance(error, KilledWorker):
-                self._bury(flight.worker)
+                self._bury(flights[0].worker)
                 return
-            ending = read_exception(error)
         else:
             try:
-                ending = read_answer(lease, flight.future.result(timeout=_GATHER_S))
+                answers = future.result(timeout=_GATHER_S)
             except (OSError, TimeoutError, CancelledError):
                 return  # the worker went before its answer was fetched: a later look finds out what is left
-            except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
-                ending = read_exception(error)
-        self._remove(key)
+            except Exception as broken:  # noqa: BLE001 - the answer came from another process and may be anything
+                error = broken
+        for flight in flights:
+            self._remove(flight.lease.key)
+        if error is not None and len(flights) > 1:
+            self._suspect(flights, f"one of {len(flights)} runs may be the cause: {read_exception(error).detail}")
+            return
+        for flight in flights:
+            self._end(flight, answers if error is None else error, results)
+
+    def _end(self, flight: Flight, answers: Any, results: list[tuple[Lease, ResultPayload]]) -> None:
+        lease = flight.lease
+        ending: ResultPayload | Failure | OtherEngine
+        try:
+            broken = isinstance(answers, BaseException)
+            ending = read_exception(answers) if broken else read_part(lease, answers, flight.place)
+        except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
+            ending = read_exception(error)
         if isinstance(ending, Failure):
             _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, ending.detail)
             self._endings.append(partial(self._queue.fail, lease, ending))
@@ -219,19 +245,24 @@ class Dispatcher:
             _LOG.warning("run %s, attempt %d: engine %s", lease.run_id, lease.attempt, ending.digest)
             self._endings.append(partial(self._queue.refuse_engine, lease, ending.digest))
         else:
-            self._endings.append(partial(self._store, lease, ending))
+            results.append((lease, ending))
 
-    def _store(self, lease: Lease, payload: ResultPayload) -> None:
+    def _store(self, results: list[tuple[Lease, ResultPayload]]) -> None:
         try:
-            stored = self._queue.store(lease, payload)
+            stored = self._queue.store_all(results)
         except (OperationalError, InterfaceError):
             raise
         except DBAPIError as error:
-            _LOG.exception("run %s cannot be stored", lease.run_id)
-            self._queue.fail(lease, unstorable(error))
+            if len(results) > 1:
+                # Nothing was stored; each is tried alone, so that one that is refused keeps no other out.
+                self._endings.extend(partial(self._store, [one]) for one in results)
+                return
+            _LOG.exception("run %s cannot be stored", results[0][0].run_id)
+            self._queue.fail(results[0][0], unstorable(error))
             return
-        if stored is not Stored.STORED:
-            _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, stored)
+        for (lease, _), outcome in zip(results, stored, strict=True):
+            if outcome is not Stored.STORED:
+                _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, outcome)
 
     def _write_endings(self) -> None:
         while self._endings:
@@ -268,9 +299,11 @@ class Dispatcher:
         if verdict.guilty is not None:
             self._endings.append(partial(self._queue.fail, verdict.guilty.lease, worker_lost()))
         if verdict.suspects:
-            leases = [flight.lease for flight in verdict.suspects]
-            detail = f"one of {len(leases)} runs may have killed a worker"
-            self._endings.append(partial(self._queue.suspect, leases, detail))
+            self._suspect(verdict.suspects, f"one of {len(verdict.suspects)} runs may have killed a worker")
+
+    def _suspect(self, flights: Sequence[Flight], detail: str) -> None:
+        """Runs one of which is to blame go back uncharged, to be tried one at a time."""
+        self._endings.append(partial(self._queue.suspect, [flight.lease for flight in flights], detail))
 
     def _lose(self, flights: Iterable[Flight], detail: str) -> None:
         """Runs that are not to blame go back uncharged."""
@@ -303,10 +336,14 @@ class Dispatcher:
                 self._lose([self._remove(key)], "no workers" if stranded else "unknown to Dask")
                 flight.future.cancel()
             elif now - flight.started > self._settings.deadline_s:
-                self._queue.fail(flight.lease, overdue(self._settings.deadline_s))
+                ending = overdue(self._settings.deadline_s)
                 overdue_flights.append(self._remove(key))
+                if flight.beside:
+                    self._suspect([flight], f"one of {flight.beside + 1} runs was {ending.detail}")
+                else:
+                    self._endings.append(partial(self._queue.fail, flight.lease, ending))
             elif flight.future.done():
-                self._done.put(key)  # in case the callback was lost
+                self._done.put(flight.future.key)  # in case the callback was lost
         self._stop_workers_of(overdue_flights)
         self._write_endings()
         known = [*self._flights.values(), *self._deaths.waiting]

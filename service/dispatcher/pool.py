@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from uuid import uuid4
 from service.dispatcher.clusters import open_client
 from service.settings import Settings
 from service.store.leases import Lease
-from service.worker import Greeting, call_task, greet
+from service.worker import Greeting, call_tasks, greet
 
 _LOG = logging.getLogger(__name__)
 _STOP_S = 5.0
@@ -70,11 +70,10 @@ class Pool:
             return []
         return [worker for address, worker in self._workers.items() if address not in self._stopping]
 
-    def submit(self, lease: Lease, worker: Worker, done: Callable[[Any], None]) -> Any:
-        """Start a run; ``done`` is called with the future from another thread when it has ended."""
-        future = self._on(worker.address, lease.key, call_task, lease.spec, self._settings.artefacts)
-        future.add_done_callback(done)
-        return future
+    def submit(self, leases: Sequence[Lease], worker: Worker) -> Any:
+        """Start runs, one after the other as one task; the future of their answers, in the same order."""
+        specs = [lease.spec for lease in leases]
+        return self._on(worker.address, leases[0].key, call_tasks, specs, self._settings.artefacts)
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""

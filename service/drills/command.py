@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from service.drills.drill import Drill
 from service.drills.kills import DispatcherKills, SchedulerKills, WorkerKills
+from service.drills.scale import Throughput
 
 DRILLS: dict[str, type[Drill]] = {
     drill.name: drill
@@ -13,5 +14,6 @@ DRILLS: dict[str, type[Drill]] = {
         DispatcherKills,
         WorkerKills,
         SchedulerKills,
+        Throughput,
     )
 }

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
@@ -56,9 +56,13 @@ class Installation:
         Of its data, logs and executions.
     settings
         Environment variables on top of a drill's own: a brief task, a free port, a reconciliation every second.
+    commands
+        What is started: ``hostlens serve``, or processes one by one, which nobody then starts again.
     """
 
-    def __init__(self, folder: Path, **settings: str) -> None:
+    def __init__(
+        self, folder: Path, *, commands: Sequence[tuple[str, ...]] = (("service", "serve"),), **settings: str
+    ) -> None:
         self.folder = folder
         self.port = free_port()
         self.log = folder / "serve.log"
@@ -79,7 +83,12 @@ class Installation:
             **settings,
         }
         self.client = Client(f"http://127.0.0.1:{self.port}")
-        self.process = self.start("service", "serve")
+        self.started = [self.start(*command) for command in commands]
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        """The process that was started first: the supervisor, unless the drill does without."""
+        return self.started[0]
 
     @property
     def database(self) -> str:
@@ -173,7 +182,8 @@ class Installation:
         for process in self.processes():
             with suppress(psutil.Error):
                 process.kill()
-        self.process.wait(timeout=20)
+        for started in self.started:
+            started.wait(timeout=20)
 
     def tail(self) -> str:
         """The last lines of the log."""
@@ -181,10 +191,12 @@ class Installation:
 
 
 @contextmanager
-def installation(folder: Path, **settings: str) -> Iterator[Installation]:
+def installation(
+    folder: Path, *, commands: Sequence[tuple[str, ...]] = (("service", "serve"),), **settings: str
+) -> Iterator[Installation]:
     """A service that is ready, and gone afterwards, whatever happened."""
     folder.mkdir(parents=True, exist_ok=True)
-    own = Installation(folder, **settings)
+    own = Installation(folder, commands=commands, **settings)
     try:
         own.wait_ready()
         yield own

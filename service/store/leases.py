@@ -54,8 +54,11 @@ class Lease:
 
     @property
     def key(self) -> str:
-        """Name of the Dask task: never the same twice, so that Dask takes no old answer for a new one."""
-        return f"{self.run_id}-{self.attempt}-{self.token}"
+        """Name of the Dask task: never the same twice, so that Dask takes no old answer for a new one.
+
+        All begin alike: Dask's scheduler keeps statistics for each beginning, and never drops them.
+        """
+        return f"run-{self.run_id}-{self.attempt}-{self.token}"
 
 
 _LEASED = (
@@ -177,9 +180,20 @@ def final_state(runs: dict[str, int]) -> GridState:
     return GridState.DONE
 
 
+def new_event(
+    grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any
+) -> dict[str, Any]:
+    """A row of the outbox."""
+    return {"grid_id": grid_id, "run_id": run_id, "kind": kind, "detail": detail, "created_at": now}
+
+
+def add_events(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
+    """Add to the outbox, in the transaction of the changes that the events report."""
+    connection.execute(insert(event), rows)
+
+
 def add_event(
     connection: Connection, grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any
 ) -> None:
-    """Add to the outbox, in the transaction of the change that the event reports."""
-    row = {"grid_id": grid_id, "run_id": run_id, "kind": kind, "detail": detail, "created_at": now}
-    connection.execute(insert(event), row)
+    """Add one event to the outbox, in the transaction of the change that it reports."""
+    add_events(connection, [new_event(grid_id, kind, now, run_id, **detail)])

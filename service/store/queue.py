@@ -9,7 +9,7 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, exists, false, func, insert, literal_column, select, true
+from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, insert, literal_column, select, true
 
 from service.identifiers import new_token, utc_now
 from service.payload import ResultPayload
@@ -19,10 +19,12 @@ from service.store.leases import (
     Lease,
     Outcome,
     add_event,
+    add_events,
     close_grids,
     end_attempts,
     held_by,
     leased,
+    new_event,
     requeue,
 )
 from service.store.results import result_row
@@ -133,18 +135,45 @@ class RunQueue:
         or has two. A lease that is no longer valid leaves everything as it is; its result is compared with the one
         that was stored instead, because two executions of one run ought to agree.
         """
+        return self.store_all([(lease, payload)])[0]
+
+    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+        """Store several results as :meth:`store` does each, in one transaction: all of them are stored, or none.
+
+        Short runs end faster than a disk can confirm one transaction each.
+        """
         now = self._clock()
         with self._database.write() as connection:
-            rows = leased(connection, held_by(lease))
-            if not rows:
-                return self._stale(connection, lease, payload, now)
-            end_attempts(connection, rows, Outcome.DONE, now)
-            move(connection, FINISH, held_by(lease), finished_at=now, error_code=None, error_detail=None)
-            inputs = connection.scalar(select(run.c.inputs).where(run.c.id == lease.run_id))
-            connection.execute(insert(result), result_row(lease, inputs or {}, payload, now))
-            add_event(connection, lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt)
-            close_grids(connection, [lease.grid_id], now)
-            return Stored.STORED
+            rows = leased(connection, _held_by_any([lease for lease, _ in results]))
+            held = {(row.id, row.token) for row in rows}
+            valid = [(lease, payload) for lease, payload in results if (lease.run_id, lease.token) in held]
+            if valid:
+                self._finish(connection, rows, valid, now)
+            return [
+                Stored.STORED if (lease.run_id, lease.token) in held else self._stale(connection, lease, payload, now)
+                for lease, payload in results
+            ]
+
+    @staticmethod
+    def _finish(
+        connection: Connection,
+        rows: Sequence[Row[*tuple[Any, ...]]],
+        results: Sequence[tuple[Lease, ResultPayload]],
+        now: datetime,
+    ) -> None:
+        """Move leased runs to done with their results; the caller holds the locks."""
+        ids = [lease.run_id for lease, _ in results]
+        end_attempts(connection, rows, Outcome.DONE, now)
+        move(connection, FINISH, run.c.id.in_(ids), finished_at=now, error_code=None, error_detail=None)
+        asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
+        inputs = {row.id: row.inputs for row in asked}
+        stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
+        connection.execute(insert(result), stored)
+        add_events(
+            connection,
+            [new_event(lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt) for lease, _ in results],
+        )
+        close_grids(connection, {lease.grid_id for lease, _ in results}, now)
 
     def fail(self, lease: Lease, failure: Failure) -> RunState | None:
         """End a failed attempt: back to the queue with a delay while retries are left, else to a terminal state.

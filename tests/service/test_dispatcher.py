@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 from distributed import KilledWorker
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import DataError, OperationalError
 
 from engine import engine_digest
 from service.dispatcher.attribution import Deaths
@@ -27,21 +28,29 @@ from service.store.leadership import Leadership, LeadershipLostError
 from service.store.leases import Lease
 from service.store.queue import RunQueue, Stored
 from service.store.states import GridState
-from service.worker import call_task
+from service.worker import call_tasks
 from tests.service.plans import body, planned
 
 
 class Answered:
     """A Dask future that has its answer already, or never gets one."""
 
-    def __init__(
-        self, answer: Any = None, status: str = "finished", told: Callable[[Any], None] = lambda _: None
-    ) -> None:
-        self._answer = answer
-        self._told = told
-        self.spec: dict[str, Any] = {}
+    def __init__(self, leases: Sequence[Lease], status: str) -> None:
+        self.key = leases[0].key
         self.status = status
-        self.key = "key"
+        self._specs = [lease.spec for lease in leases]
+        self._answers: Any = None
+        self._told: Callable[[Any], None] = lambda _: None
+
+    def add_done_callback(self, told: Callable[[Any], None]) -> None:
+        self._told = told
+        if self.done() and self.status != "lost" and self.status != "cancelled":
+            told(self)
+
+    def answer(self, folder: Path) -> None:
+        """It has run."""
+        self._answers = call_tasks("tests.service.tasks:fast", self._specs, str(folder))
+        self.status = "finished"
 
     def kill(self) -> None:
         """Its worker dies."""
@@ -51,15 +60,14 @@ class Answered:
     def finish(self, folder: Path) -> None:
         """It ends well, if it has not ended."""
         if self.status == "pending":
-            self._answer = call_task("tests.service.tasks:fast", self.spec, str(folder))
-            self.status = "finished"
+            self.answer(folder)
             self._told(self)
 
     def exception(self, timeout: float) -> BaseException:
         return KilledWorker(self.key, None, 0)
 
     def result(self, timeout: float) -> Any:
-        return self._answer
+        return self._answers
 
     def done(self) -> bool:
         return self.status != "pending"
@@ -81,6 +89,7 @@ class InstantPool:
         self.engine = engine_digest()
         self.stopped: list[Any] = []
         self.submitted: list[str] = []
+        self.batches: list[int] = []
         self.placed: list[tuple[str, Lease]] = []
         self.futures: list[Answered] = []
 
@@ -90,16 +99,14 @@ class InstantPool:
     def present(self) -> list[str]:
         return self.addresses
 
-    def submit(self, lease: Lease, worker: Worker, done: Callable[[Any], None]) -> Answered:
-        self.submitted.append(lease.run_id)
-        self.placed.append((worker.address, lease))
-        status = self.statuses.pop(0) if self.statuses else "finished"
-        answer = call_task("tests.service.tasks:fast", lease.spec, str(self.folder)) if status == "finished" else None
-        future = Answered(answer, status, done)
-        future.spec = lease.spec
+    def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+        self.submitted += [lease.run_id for lease in leases]
+        self.placed += [(worker.address, lease) for lease in leases]
+        self.batches.append(len(leases))
+        future = Answered(leases, self.statuses.pop(0) if self.statuses else "finished")
+        if future.status == "finished":
+            future.answer(self.folder)
         self.futures.append(future)
-        if status in {"finished", "error"}:
-            done(future)
         return future
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
@@ -125,13 +132,13 @@ class ShakyQueue(RunQueue):
         self.events.append("claim")
         return super().claim(generation, limit, engine, suspects=suspects)
 
-    def store(self, lease: Lease, payload: ResultPayload) -> Stored:
+    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
         if self.away:
             self.away -= 1
             self.events.append("away")
             raise OperationalError("INSERT", {}, Exception("the database is away"))
         self.events.append("store")
-        return super().store(lease, payload)
+        return super().store_all(results)
 
 
 @pytest.fixture(autouse=True)
@@ -180,7 +187,7 @@ def test_a_result_is_kept_while_the_database_is_away_and_nothing_is_claimed_mean
     setting.run()
     assert setting.grids.grid(setting.grid_id).state is GridState.DONE
     assert len(setting.pool.submitted) == len(set(setting.pool.submitted)) == 6
-    assert setting.queue.events[:6] == ["claim", "away", "away", "away", "store", "store"]
+    assert setting.queue.events[:6] == ["claim", "away", "away", "away", "store", "claim"]
 
 
 def test_a_run_that_dask_has_lost_is_run_again_uncharged(database: Database, tmp_path: Path) -> None:
@@ -271,15 +278,47 @@ def test_a_run_that_kills_three_workers_is_quarantined_and_no_other_is_charged(
     database: Database, tmp_path: Path
 ) -> None:
     class Poisoned(InstantPool):
-        def submit(self, lease: Lease, worker: Worker, done: Callable[[Any], None]) -> Answered:
-            self.statuses = ["error" if lease.run_id.endswith("1") else "finished"]
-            return super().submit(lease, worker, done)
+        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+            self.statuses = ["error" if leases[0].run_id.endswith("1") else "finished"]
+            return super().submit(leases, worker)
 
     setting = Setting(database, Poisoned(tmp_path), runs=5)
     setting.run(steps=2000)
     counts = setting.grids.grid(setting.grid_id).counts
     assert (counts.done, counts.quarantined) == (4, 1)
     assert outcomes(setting) == [["done"], ["worker_lost"] * 3, ["done"], ["done"], ["done"]]
+
+
+def test_short_runs_go_several_at_a_time_and_a_death_among_them_charges_only_the_one_that_dies_alone(
+    database: Database, tmp_path: Path
+) -> None:
+    class Poisoned(InstantPool):
+        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+            self.statuses = ["error" if any(lease.run_id.endswith("1") for lease in leases) else "finished"]
+            return super().submit(leases, worker)
+
+    pool = Poisoned(tmp_path)
+    setting = Setting(database, pool, runs=10, batch=4)
+    setting.run(steps=5000)
+    assert pool.batches[:4] == [4, 4, 1, 1]
+    counts = setting.grids.grid(setting.grid_id).counts
+    assert (counts.done, counts.quarantined) == (9, 1)
+    ended = Counter(end for ends in outcomes(setting) for end in ends)
+    assert ended == {"done": 9, "suspected": 4, "worker_lost": 3}
+
+
+def test_one_result_that_the_database_refuses_keeps_no_other_out(database: Database, tmp_path: Path) -> None:
+    class Fussy(ShakyQueue):
+        def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+            if any(lease.spec["seed"] == 3 for lease, _ in results):
+                raise DataError("INSERT", {}, Exception("numeric value out of range"))
+            return super().store_all(results)
+
+    setting = Setting(database, InstantPool(tmp_path), runs=8, batch=4)
+    setting.queue.__class__ = Fussy
+    setting.run()
+    counts = setting.grids.grid(setting.grid_id).counts
+    assert (counts.done, counts.failed) == (7, 1)
 
 
 def test_a_run_whose_worker_left_without_dask_blaming_it_goes_back_uncharged(
