@@ -24,6 +24,7 @@ from engine.spec import (
     NoiseLevel,
     Realization,
     realization_from_dict,
+    spec_digest,
     spec_error,
 )
 
@@ -63,6 +64,7 @@ __all__ = [
     "preset_names",
     "realization_from_dict",
     "run",
+    "spec_digest",
     "spec_error",
     "system_facts",
     "system_names",

@@ -22,6 +22,7 @@ from engine import (
     load_camera,
     load_system,
     preset_names,
+    spec_digest,
     system_facts,
     system_names,
 )
@@ -150,7 +151,8 @@ def _planned(run: GridRun) -> PlannedRun:
         "magnitude": realization.host.magnitude,
         "seed": realization.seed,
     }
-    return PlannedRun(run.label, run.paper_run, realization.to_dict(), inputs, realization.digest)
+    spec = realization.to_dict()
+    return PlannedRun(run.label, run.paper_run, spec, inputs, spec_digest(spec))
 
 
 def _system_camera(name: str) -> str:

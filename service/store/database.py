@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from pydantic_core import from_json, to_json
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import make_url
 from sqlalchemy.pool import NullPool
@@ -32,7 +33,9 @@ class Database:
             options["connect_args"] = {"timeout": BUSY_TIMEOUT_MS / 1000}
         else:
             options["connect_args"] = {"connect_timeout": CONNECT_TIMEOUT_S}
-        self.engine: Engine = create_engine(self.url, **options)
+        self.engine: Engine = create_engine(
+            self.url, json_serializer=_to_json, json_deserializer=from_json, **options
+        )
         if self.is_sqlite:
             event.listen(self.engine, "connect", _prepare_sqlite)
             if foreign_keys:
@@ -60,6 +63,11 @@ class Database:
     def close(self) -> None:
         """Close all pooled connections."""
         self.engine.dispose()
+
+
+def _to_json(value: Any) -> str:
+    # A grid of 100,000 runs has 200,000 documents, which the standard library takes four times as long for.
+    return to_json(value).decode()
 
 
 def _prepare_sqlite(connection: Any, _record: Any) -> None:
