@@ -1,11 +1,12 @@
-"""``hostlens drill``: the drills by name."""
+"""The drills by name, for ``hostlens drill``."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from service.drills.drill import Drill
 from service.drills.kills import DispatcherKills, SchedulerKills, WorkerKills
+from service.drills.outages import DiskFull, PostgresKills, SqliteLock
+from service.drills.requests import Cancel, Idempotency
+from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from service.drills.scale import Throughput
 
 DRILLS: dict[str, type[Drill]] = {
@@ -14,6 +15,14 @@ DRILLS: dict[str, type[Drill]] = {
         DispatcherKills,
         WorkerKills,
         SchedulerKills,
+        PostgresKills,
+        SqliteLock,
+        StoppedWorker,
+        TwoDispatchers,
+        Poison,
+        Cancel,
+        Idempotency,
+        DiskFull,
         Throughput,
     )
 }

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from threading import Event, Thread
 from typing import ClassVar
 
 import psutil
 
+from service.drills.cluster import Cluster, kept_running
 from service.drills.drill import Drill, Ground, body
 from service.drills.installation import Installation, eventually, free_port, installation
 from service.drills.records import Records, records
@@ -37,6 +36,16 @@ def stored_once(found: Records, runs: int) -> Claim:
 def identical(found: Records, calm: Records) -> Claim:
     """That a disturbed grid's table is an undisturbed one's."""
     return Claim("table identical to an undisturbed grid's", found.results == calm.results)
+
+
+def progress(service: Installation, grid_id: str, least: int) -> int:
+    """Wait until so many runs of a grid are done; how many are."""
+
+    def look() -> int:
+        done = service.client.status(grid_id).counts.done
+        return done if done >= least else 0
+
+    return eventually(look, 120, f"the result number {least}")
 
 
 @dataclass(frozen=True)
@@ -62,9 +71,9 @@ class DispatcherKills(Drill):
             grid = service.client.submit(body(self.runs))
             for number in range(self.kills):
                 least = (number * self.runs) // (self.kills + 1) + 1
-                done = self._progress(service, grid.id, least)
+                done = progress(service, grid.id, least)
                 killed = self._kill(service)
-                self._progress(service, grid.id, done + 1)
+                progress(service, grid.id, done + 1)
                 gaps.append(time.monotonic() - killed)
             service.watch(grid.id)
             took = time.monotonic() - began
@@ -94,14 +103,6 @@ class DispatcherKills(Drill):
                 Claim("the service then ends in order and leaves no process", code == 0 and left == 0),
             ),
         )
-
-    @staticmethod
-    def _progress(service: Installation, grid_id: str, least: int) -> int:
-        def look() -> int:
-            done = service.client.status(grid_id).counts.done
-            return done if done >= least else 0
-
-        return eventually(look, 120, f"the result number {least}")
 
     @staticmethod
     def _kill(service: Installation) -> float:
@@ -171,58 +172,6 @@ class WorkerKills(Drill):
         )
 
 
-_SCHEDULER = {
-    "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
-    "DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION": "1.0",
-    "DASK_DISTRIBUTED__SCHEDULER__WORK_STEALING": "False",
-}
-
-
-@dataclass
-class Cluster:
-    """A Dask scheduler and workers as processes of their own, each started again when it ends, as a unit would."""
-
-    service: Installation
-    workers: int
-    port: int = field(default_factory=free_port)
-
-    @property
-    def address(self) -> str:
-        """Where the scheduler listens."""
-        return f"tcp://127.0.0.1:{self.port}"
-
-    def scheduler(self) -> subprocess.Popen[bytes]:
-        """Start the scheduler."""
-        listen = ("--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard")
-        return self.service.start("dask", "scheduler", *listen, **_SCHEDULER)
-
-    def worker(self) -> subprocess.Popen[bytes]:
-        """Start a worker with one thread."""
-        room = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.service.folder / "dask"))
-        return self.service.start("dask", "worker", self.address, *room, "--death-timeout", "20")
-
-
-@contextmanager
-def kept_running(cluster: Cluster) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Scheduler (first) and workers for as long as the context lasts."""
-    running = [cluster.scheduler(), *(cluster.worker() for _ in range(cluster.workers))]
-    stop = Event()
-
-    def look() -> None:
-        while not stop.wait(0.2):
-            for place, process in enumerate(running):
-                if process.poll() is not None and not stop.is_set():
-                    running[place] = cluster.worker() if place else cluster.scheduler()
-
-    keeper = Thread(target=look, name="keeper")
-    keeper.start()
-    try:
-        yield running
-    finally:
-        stop.set()
-        keeper.join()
-
-
 @dataclass(frozen=True)
 class SchedulerKills(Drill):
     """kill -9 of a scheduler that runs apart from the service."""
@@ -256,10 +205,10 @@ class SchedulerKills(Drill):
                 grid = service.client.submit(body(self.runs))
                 for number in range(self.kills):
                     least = (number * self.runs) // (self.kills + 1) + 1
-                    done = DispatcherKills._progress(service, grid.id, least)
+                    done = progress(service, grid.id, least)
                     os.kill(running[0].pid, signal.SIGKILL)
                     killed = time.monotonic()
-                    DispatcherKills._progress(service, grid.id, done + 3)
+                    progress(service, grid.id, done + 3)
                     gaps.append(time.monotonic() - killed)
                 service.watch(grid.id)
                 took = time.monotonic() - began

@@ -72,14 +72,14 @@ class Throughput(Drill):
 
     runs: int = 100_000
     workers: int = 1
-    window: int = 64
+    batch: int = 32
 
     def run(self, ground: Ground) -> Report:
         """Submit one grid and look at the dispatcher's memory while it is worked off."""
         settings = {
             "HOSTLENS_TASK": "service.drills.tasks:nothing",
             "HOSTLENS_WORKERS": str(self.workers),
-            "HOSTLENS_WINDOW": str(self.window),
+            "HOSTLENS_BATCH": str(self.batch),
             "HOSTLENS_RECONCILE_S": "10",
         }
         memory: list[tuple[int, float]] = []
@@ -102,10 +102,11 @@ class Throughput(Drill):
             claims = claim_times(service)
         # What the process needs to warm up is no growth.
         warm = next((size for done, size in memory if done >= 0.02 * self.runs), memory[-1][1])
+        middle = next((size for done, size in memory if done >= 0.5 * self.runs), memory[-1][1])
         rate, growth, p99 = self.runs / took, memory[-1][1] - warm, 1e3 * quantile(claims, 0.99)
         return Report(
             self.name,
-            f"{self.runs} runs, window {self.window}, {self.workers} local worker(s), all processes on one core, "
+            f"{self.runs} runs, {self.batch} at a time, {self.workers} local worker(s), all processes on one core, "
             f"{ground.backend}",
             (
                 Figure("rate", rate, "runs/s"),
@@ -115,6 +116,7 @@ class Throughput(Drill):
                 Figure("runs per CPU second", self.runs / sum(used.values()), "runs/s"),
                 Figure("dispatcher memory, warm", warm, "MB"),
                 Figure("dispatcher memory, growth", growth, "MB"),
+                Figure("of it in the second half", memory[-1][1] - middle, "MB"),
                 Figure("claims", len(claims)),
                 Figure("claim, median", 1e3 * quantile(claims, 0.5), "ms"),
                 Figure("claim, p99", p99, "ms"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from typing import Any
 
 from service.settings import Settings
 from service.store.leases import Lease
@@ -16,9 +17,9 @@ from service.store.queue import RunQueue
 _CLAIM = RunQueue.claim
 
 
-def _timed_claim(queue: RunQueue, generation: int, limit: int) -> list[Lease]:
+def _timed_claim(queue: RunQueue, *arguments: Any, **options: Any) -> list[Lease]:
     began = time.perf_counter()
-    leases = _CLAIM(queue, generation, limit)
+    leases = _CLAIM(queue, *arguments, **options)
     took = time.perf_counter() - began
     with open(os.environ["HOSTLENS_DRILL_TIMES"], "a", encoding="utf-8") as file:
         file.write(f"{took:.6f} {len(leases)}\n")
