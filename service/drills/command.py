@@ -8,6 +8,7 @@ from service.drills.outages import DiskFull, PostgresKills, SqliteLock
 from service.drills.requests import Cancel, Idempotency
 from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from service.drills.scale import Throughput
+from service.drills.volume import Listing, Submission
 
 DRILLS: dict[str, type[Drill]] = {
     drill.name: drill
@@ -24,5 +25,7 @@ DRILLS: dict[str, type[Drill]] = {
         Idempotency,
         DiskFull,
         Throughput,
+        Submission,
+        Listing,
     )
 }

@@ -192,13 +192,20 @@ class Installation:
 
 @contextmanager
 def installation(
-    folder: Path, *, commands: Sequence[tuple[str, ...]] = (("service", "serve"),), **settings: str
+    folder: Path,
+    *,
+    commands: Sequence[tuple[str, ...]] = (("service", "serve"),),
+    ready: bool = True,
+    **settings: str,
 ) -> Iterator[Installation]:
-    """A service that is ready, and gone afterwards, whatever happened."""
+    """A service that computes (or, where it is not to be ``ready``, answers), and is gone afterwards in any case."""
     folder.mkdir(parents=True, exist_ok=True)
     own = Installation(folder, commands=commands, **settings)
     try:
-        own.wait_ready()
+        if ready:
+            own.wait_ready()
+        else:
+            eventually(own.readiness, 60, "an answer")
         yield own
     finally:
         own.kill_all()

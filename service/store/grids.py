@@ -17,13 +17,13 @@ from service.identifiers import new_grid_id, run_id, utc_now
 from service.schemas import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, close_grids, lock_grids, pause_queued
+from service.store.pace import recent
 from service.store.states import CANCEL, RESUME, REVIVE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, idempotency, result, run
-from service.store.views import RUN_COLUMNS, Recent, grid_view, run_detail, run_view
+from service.store.views import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
 
 _T = TypeVar("_T")
 _BATCH = 5000
-_RATE_RUNS = 100
 
 
 class NotFoundError(LookupError):
@@ -223,7 +223,7 @@ class GridStore:
             mine = run.c.grid_id == grid_id
             moved = move(connection, REVIVE, mine, error_code=None, error_detail=None, **fresh)
             if moved:
-                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None}
+                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
                 connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))
                 add_event(connection, grid_id, "grid_revived", now, runs=len(moved))
                 pause_queued(connection, mine)
@@ -242,27 +242,19 @@ class GridStore:
         return self._views(connection, [row])[0]
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
-        ids = [row.id for row in rows]
+        now = self._clock()
+        # What has ended does not change, and was counted when it ended.
+        ids = [row.id for row in rows if row.ending is None]
         counted = select(run.c.grid_id, run.c.state, func.count().label("runs")).where(run.c.grid_id.in_(ids))
         counts: dict[str, dict[str, int]] = {grid_id: {} for grid_id in ids}
-        for row in connection.execute(counted.group_by(run.c.grid_id, run.c.state)):
+        for row in connection.execute(counted.group_by(run.c.grid_id, run.c.state)) if ids else ():
             counts[row.grid_id][row.state] = row.runs
-        now = self._clock()
-        return [grid_view(row, counts[row.id], self._recent(connection, row), now) for row in rows]
-
-    @staticmethod
-    def _recent(connection: Connection, row: Row[Any]) -> Recent | None:
-        """What the rate is measured on: the latest runs that were worked on, and when the first of them began."""
-        ended = (
-            select(run.c.finished_at, run.c.leased_at)
-            .where(run.c.grid_id == row.id, run.c.finished_at.is_not(None), run.c.leased_at.is_not(None))
-            .order_by(run.c.finished_at.desc())
-            .limit(_RATE_RUNS)
-        )
-        found = connection.execute(ended).all()
-        if not found:
-            return None
-        return Recent(len(found), min(other.leased_at for other in found), found[0].finished_at)
+        return [
+            grid_view(row, counts[row.id], recent(connection, row.id), now)
+            if row.ending is None
+            else ended_grid_view(row)
+            for row in rows
+        ]
 
     @staticmethod
     def _require(connection: Connection, grid_id: str) -> None:

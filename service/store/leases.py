@@ -13,6 +13,7 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
 
+from service.store.pace import recent
 from service.store.states import CANCEL, OPEN_STATES, PAUSE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
 
@@ -164,10 +165,10 @@ def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) 
             continue
         counted = select(run.c.state, func.count().label("runs")).where(mine).group_by(run.c.state)
         runs = {row.state: row.runs for row in connection.execute(counted)}
-        state = final_state(runs)
-        connection.execute(
-            update(grid).where(grid.c.id == grid_id).values(state=state, finished_at=now, paused_at=None)
-        )
+        state, latest = final_state(runs), recent(connection, grid_id)
+        ending = {"counts": runs, "rate_per_s": latest and latest.rate()}
+        values = {"state": state, "finished_at": now, "paused_at": None, "ending": ending}
+        connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))
         add_event(connection, grid_id, "grid_finished", now, state=state, runs=runs)
 
 

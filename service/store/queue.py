@@ -29,6 +29,7 @@ from service.store.leases import (
 )
 from service.store.results import result_row
 from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move
+from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
 
 _MAX_DELAY_S = 600.0
@@ -169,6 +170,7 @@ class RunQueue:
         inputs = {row.id: row.inputs for row in asked}
         stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
         connection.execute(insert(result), stored)
+        add_to_sums(connection, stored)
         add_events(
             connection,
             [new_event(lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt) for lease, _ in results],

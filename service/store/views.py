@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -23,6 +22,7 @@ from service.schemas import (
     RunError,
     RunView,
 )
+from service.store.pace import Recent
 from service.store.states import GridState, RunState
 from service.store.tables import run
 
@@ -35,13 +35,9 @@ RUN_COLUMNS = tuple(
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Recent:
-    """The latest runs that ended: how many, when the first of them began, when the last ended."""
-
-    runs: int
-    began_at: datetime
-    ended_at: datetime
+def ended_grid_view(row: Row[Any]) -> GridView:
+    """A grid none of whose runs is open, from what was written down at its end."""
+    return _grid_view(row, RunCounts(**row.ending["counts"]), GridState(row.state), row.ending["rate_per_s"], 0.0)
 
 
 def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
@@ -56,6 +52,12 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
     rate, left = _pace(recent, remaining, now)
     if state is GridState.PAUSED:
         left = None
+    return _grid_view(row, runs, state, rate, left)
+
+
+def _grid_view(
+    row: Row[Any], runs: RunCounts, state: GridState, rate: float | None, left: float | None
+) -> GridView:
     return GridView(
         id=row.id,
         name=row.name,
@@ -89,10 +91,10 @@ def _pace(recent: Recent | None, remaining: int, now: datetime) -> tuple[float |
     """
     if recent is None:
         return None, 0.0 if not remaining else None
-    rate = recent.runs / max((recent.ended_at - recent.began_at).total_seconds(), 1e-3)
+    rate = recent.rate()
     left = remaining / rate - (now - recent.ended_at).total_seconds()
     if remaining and left <= 0.0:
-        rate = recent.runs / max((now - recent.began_at).total_seconds(), 1e-3)
+        rate = recent.rate(now)
         left = remaining / rate
     return rate, max(left, 0.0) if remaining else 0.0
 
