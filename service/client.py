@@ -87,7 +87,7 @@ class Client:
 
     def summary(self, grid_id: str) -> Summary:
         """Biases of a grid (the first thousand inputs)."""
-        return Summary.model_validate(self._call("GET", f"/v1/grids/{grid_id}/summary"))
+        return Summary.model_validate(self._call("GET", f"/v1/grids/{grid_id}/summary", params={"limit": 1000}))
 
     def cancel(self, grid_id: str) -> GridView:
         """Cancel a grid."""

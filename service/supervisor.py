@@ -17,7 +17,7 @@ from pathlib import Path
 from threading import Event
 from typing import IO
 
-from service.process import PARENT_FD
+from service.process import PARENT_FD, stop_with_parent
 from service.settings import Settings
 from service.store.migrate import upgrade
 
@@ -177,6 +177,7 @@ def serve(settings: Settings, started: Callable[[], None] = lambda: None) -> Non
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    stop_with_parent()
     require_free(settings)
     supervisor = Supervisor(settings)
     supervisor.prepare()

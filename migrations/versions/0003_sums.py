@@ -49,9 +49,8 @@ def _fill(table, keys, parts):
             }
             sums |= {f"{name}_{part}": known[part] for part in parts}
     by = ", ".join(keys)
-    op.execute(
-        f"insert into {table} ({by}, {', '.join(sums)}) select {by}, {', '.join(sums.values())} from result group by {by}"
-    )
+    columns, values = ", ".join(sums), ", ".join(sums.values())
+    op.execute(f"insert into {table} ({by}, {columns}) select {by}, {values} from result group by {by}")  # noqa: S608
 
 
 def upgrade():

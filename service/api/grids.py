@@ -91,7 +91,7 @@ def summary(
     response: Response,
     grid_id: GridId,
     service: Service,
-    limit: Limit = 1000,
+    limit: Limit = 100,
     cursor: Ordinal = 0,
 ) -> Summary:
     """Recovered values and biases by input, and over the whole grid."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -88,9 +88,9 @@ class Drill(ABC):
         for name, value in changes.items():
             if name not in known:
                 raise ValueError(f"drill {cls.name} has no size {name}: it has {', '.join(known) or 'none'}")
-            kind = type(known[name].default)
+            kind: Callable[[str], Any] = type(known[name].default)
             try:
                 sizes[name] = kind(value)
             except ValueError:
-                raise ValueError(f"{name}: got {value!r}, allowed is {kind.__name__}") from None
+                raise ValueError(f"{name}: got {value!r}, allowed is a number") from None
         return cls(**sizes)

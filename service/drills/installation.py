@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
@@ -18,6 +18,7 @@ import psutil
 
 import service
 from service.client import ApiError, Client
+from service.process import PARENT_FD
 from service.schemas import GridView, Readiness
 
 T = TypeVar("T")
@@ -61,7 +62,7 @@ class Installation:
     """
 
     def __init__(
-        self, folder: Path, *, commands: Sequence[tuple[str, ...]] = (("service", "serve"),), **settings: str
+        self, folder: Path, settings: Mapping[str, str], commands: Sequence[tuple[str, ...]] = (("service", "serve"),)
     ) -> None:
         self.folder = folder
         self.port = free_port()
@@ -82,6 +83,8 @@ class Installation:
             "HOSTLENS_RECONCILE_S": "1",
             **settings,
         }
+        # Closed with this process, however it ends: the service then ends too.
+        self._pipe = os.pipe()
         self.client = Client(f"http://127.0.0.1:{self.port}")
         self.started = [self.start(*command) for command in commands]
 
@@ -102,7 +105,8 @@ class Installation:
             return subprocess.Popen(
                 [sys.executable, "-m", module, *arguments],
                 cwd=self.folder,
-                env={**self.environment, **changes},
+                env={**self.environment, PARENT_FD: str(self._pipe[0]), **changes},
+                pass_fds=(self._pipe[0],),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -184,6 +188,9 @@ class Installation:
                 process.kill()
         for started in self.started:
             started.wait(timeout=20)
+        self.client.__exit__()
+        for end in self._pipe:
+            os.close(end)
 
     def tail(self) -> str:
         """The last lines of the log."""
@@ -193,14 +200,14 @@ class Installation:
 @contextmanager
 def installation(
     folder: Path,
+    settings: Mapping[str, str],
     *,
     commands: Sequence[tuple[str, ...]] = (("service", "serve"),),
     ready: bool = True,
-    **settings: str,
 ) -> Iterator[Installation]:
     """A service that computes (or, where it is not to be ``ready``, answers), and is gone afterwards in any case."""
     folder.mkdir(parents=True, exist_ok=True)
-    own = Installation(folder, commands=commands, **settings)
+    own = Installation(folder, settings, commands)
     try:
         if ready:
             own.wait_ready()

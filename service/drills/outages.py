@@ -1,4 +1,4 @@
-"""The database goes away: PostgreSQL killed, SQLite locked, a disk that takes no more, a file that may not be written."""
+"""The database goes away: PostgreSQL killed, SQLite locked, a disk that is full, a file that may not be written."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ class PostgresKills(Drill):
         calm = undisturbed(ground, self.runs)
         kills, stop = 0, Event()
         with postgres_server() as server:
-            own = Ground(ground.folder, server.create("drill"))
-            with installation(ground.folder / "drill", HOSTLENS_DRILL_SLEEP=str(self.sleep_s), **own.settings) as service:
+            settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_DATABASE_URL": server.create("drill")}
+            with installation(ground.folder / "drill", settings) as service:
                 service.wait_ready(2)
                 grid = service.client.submit(body(self.runs))
                 began = time.monotonic()
@@ -111,7 +111,7 @@ class SqliteLock(Drill):
         """Lock in the middle of a grid; read all the time, submit once."""
         calm = undisturbed(ground, self.runs)
         reads: list[float] = []
-        with installation(ground.folder / "drill", HOSTLENS_DRILL_SLEEP=str(self.sleep_s)) as service:
+        with installation(ground.folder / "drill", {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s)}) as service:
             service.wait_ready(2)
             grid = service.client.submit(body(self.runs))
             progress(service, grid.id, self.runs // 4)
@@ -184,7 +184,7 @@ class DiskFull(Drill):
     def run(self, ground: Ground) -> Report:
         """Take the room away in the middle of a grid."""
         calm = undisturbed(ground, self.runs)
-        with installation(ground.folder / "drill", HOSTLENS_DRILL_SLEEP=str(self.sleep_s)) as service:
+        with installation(ground.folder / "drill", {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s)}) as service:
             service.wait_ready(2)
             grid = service.client.submit(body(self.runs))
             progress(service, grid.id, self.runs // 4)
@@ -272,5 +272,3 @@ def _integrity(service: Installation) -> str:
 def _generation(service: Installation) -> int:
     with closing(Database(service.database, pooled=False)) as database, database.read() as connection:
         return int(connection.scalar(text("SELECT generation FROM leader")) or 0)
-
-

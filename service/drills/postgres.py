@@ -82,7 +82,7 @@ class PostgresServer:
             os.chown(self.home, who["user"], who["group"])
         environment = {"PATH": os.environ.get("PATH", ""), "LC_ALL": "C", "HOME": str(self.home)}
         self._options: dict[str, Any] = {"cwd": self.home, "env": environment, **who}
-        make = [self._programs / "initdb", "-D", self._data, "-U", "hostlens", "--auth=trust", "-E", "UTF8"]
+        make = [str(self._programs / "initdb"), "-D", self._data, "-U", "hostlens", "--auth=trust", "-E", "UTF8"]
         subprocess.run([*make, "--no-sync"], check=True, capture_output=True, **self._options)
 
     @property
@@ -141,7 +141,7 @@ class PostgresServer:
 
     def _launch(self) -> None:
         settings = [part for setting in self._settings for part in ("-c", setting)]
-        command = [self._programs / "postgres", "-D", self._data, "-k", str(self.home), *settings]
+        command = [str(self._programs / "postgres"), "-D", self._data, "-k", str(self.home), *settings]
         with self._log.open("ab") as log:
             self._process = subprocess.Popen(command, stdout=log, stderr=log, **self._options)
 

@@ -30,7 +30,7 @@ class Cancel(Drill):
     def run(self, ground: Ground) -> Report:
         """Cancel while two runs are under way that would take ten minutes."""
         settings = {"HOSTLENS_DRILL_SLEEP": "600", **ground.settings}
-        with installation(ground.folder / "drill", **settings) as service:
+        with installation(ground.folder / "drill", settings) as service:
             service.wait_ready(2)
             grid = service.client.submit(body(self.runs))
             eventually(lambda: service.client.status(grid.id).counts.leased == 2, 30, "two runs in flight")
@@ -73,7 +73,7 @@ class Idempotency(Drill):
         """Let all clients go at the same moment."""
         start = Barrier(self.clients)
         settings = {"HOSTLENS_DRILL_SLEEP": "600", **ground.settings}
-        with installation(ground.folder / "drill", **settings) as service:
+        with installation(ground.folder / "drill", settings) as service:
             address = f"http://127.0.0.1:{service.port}/v1/grids"
 
             def submit(_: int) -> tuple[int, str, str, float]:

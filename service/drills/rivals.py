@@ -39,7 +39,7 @@ class StoppedWorker(Drill):
         """Stop a worker that is at a run; wake it when the grid has ended, if it is still there."""
         calm = undisturbed(ground, self.runs)
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_DEADLINE_S": str(self.deadline_s)}
-        with installation(ground.folder / "drill", **settings, **ground.settings) as service:
+        with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
             service.wait_ready(2)
             grid = service.client.submit(body(self.runs))
             progress(service, grid.id, 1)
@@ -57,7 +57,8 @@ class StoppedWorker(Drill):
             found = records(service, grid.id)
         return Report(
             self.name,
-            f"{self.runs} runs of {self.sleep_s:g} s, two local workers, deadline {self.deadline_s:g} s, {ground.backend}",
+            f"{self.runs} runs of {self.sleep_s:g} s, two local workers, deadline {self.deadline_s:g} s, "
+            f"{ground.backend}",
             (
                 Figure("stored", found.stored),
                 Figure("attempts past the deadline", found.outcomes.get("deadline", 0)),
@@ -94,7 +95,7 @@ class TwoDispatchers(Drill):
         upgrade(ground.database_url or f"sqlite:///{folder / 'data' / 'hostlens.sqlite'}")
         commands = (("service.api",), ("service.dispatcher",), ("service.dispatcher",))
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), **ground.settings}
-        with installation(folder, commands=commands, **settings) as service:
+        with installation(folder, settings, commands=commands) as service:
             grid = service.client.submit(body(self.runs))
             progress(service, grid.id, self.runs // 3)
             first = _leader(service)
@@ -159,7 +160,7 @@ class Poison(Drill):
             "HOSTLENS_BATCH": str(self.batch),
         }
         guilty = {place for place in range(self.runs) if place % POISON_EVERY == 1}
-        with installation(ground.folder / "drill", **settings, **ground.settings) as service:
+        with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
             service.wait_ready(2)
             began = time.monotonic()
             grid = service.client.submit(body(self.runs))
@@ -168,7 +169,9 @@ class Poison(Drill):
             quarantined = {run.ordinal for run in service.client.runs(grid.id) if run.state == "quarantined"}
             found = records(service, grid.id)
         charged = {
-            place for place, ends in found.charged.items() if any(ends[kind] for kind in ("worker_lost", "error", "deadline"))
+            place
+            for place, ends in found.charged.items()
+            if any(ends[kind] for kind in ("worker_lost", "error", "deadline"))
         }
         return Report(
             self.name,

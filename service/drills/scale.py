@@ -14,6 +14,7 @@ import psutil
 from service.drills.drill import Drill, Ground, body
 from service.drills.installation import Installation, installation
 from service.drills.records import records
+from service.drills.remote import working_time
 from service.drills.report import Claim, Figure, Report, quantile
 from service.store.migrate import upgrade
 
@@ -34,13 +35,14 @@ def one_core(core: int | None = None) -> Iterator[int]:
 
 
 @contextmanager
-def timed(ground: Ground, **settings: str) -> Iterator[Installation]:
+def timed(ground: Ground, settings: dict[str, str]) -> Iterator[Installation]:
     """An installation whose dispatcher writes down its claims."""
     folder = ground.folder / "drill"
     (folder / "data").mkdir(parents=True)
     upgrade(ground.database_url or f"sqlite:///{folder / 'data' / 'hostlens.sqlite'}")
     times = str(folder / "claims")
-    with installation(folder, commands=APART, HOSTLENS_DRILL_TIMES=times, **ground.settings, **settings) as service:
+    everything = {"HOSTLENS_DRILL_TIMES": times, **ground.settings, **settings}
+    with installation(folder, everything, commands=APART) as service:
         yield service
 
 
@@ -83,7 +85,7 @@ class Throughput(Drill):
             "HOSTLENS_RECONCILE_S": "10",
         }
         memory: list[tuple[int, float]] = []
-        with one_core(), timed(ground, **settings) as service:
+        with one_core(), timed(ground, settings) as service:
             dispatcher = service.child("service.drills.timed_dispatcher")
             spent = cpu_seconds(service)
             began = time.monotonic()
@@ -127,5 +129,53 @@ class Throughput(Drill):
                 Claim("at least 200 runs/s", rate >= 200),
                 Claim("the dispatcher grows by less than 50 MB", growth < 50),
                 Claim("claim p99 below 50 ms", p99 < 50),
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class Overhead(Drill):
+    """What the service adds to runs of a second."""
+
+    name: ClassVar[str] = "overhead"
+    what: ClassVar[str] = "60 runs of 1 s on two local workers, settings as they are by default"
+    claim: ClassVar[str] = "overhead of a run < 2 % of its second"
+    small: ClassVar[dict[str, object]] = {"runs": 8}
+
+    runs: int = 60
+    sleep_s: float = 1.0
+    workers: int = 2
+    batch: int = 1
+
+    def run(self, ground: Ground) -> Report:
+        """Compare the time from the first start to the last end with what the runs alone would take."""
+        settings = {
+            "HOSTLENS_DRILL_SLEEP": str(self.sleep_s),
+            "HOSTLENS_WORKERS": str(self.workers),
+            "HOSTLENS_BATCH": str(self.batch),
+            **ground.settings,
+        }
+        with installation(ground.folder / "drill", settings) as service:
+            service.wait_ready(self.workers)
+            grid = service.client.submit(body(self.runs))
+            service.watch(grid.id)
+            took = working_time(service, grid.id)
+            found = records(service, grid.id)
+        alone = self.sleep_s * self.runs / self.workers
+        share = took / alone - 1.0
+        return Report(
+            self.name,
+            f"{self.runs} runs of {self.sleep_s:g} s, {self.workers} local workers, {self.batch} at a time, "
+            f"{ground.backend}",
+            (
+                Figure("first start to last end", took, "s"),
+                Figure("the runs alone", alone, "s"),
+                Figure("overhead of a run", 1e3 * share * self.sleep_s, "ms"),
+                Figure("share", 1e2 * share, "%"),
+                Figure("load of the machine at the end", os.getloadavg()[0]),
+            ),
+            (
+                Claim(f"{self.runs} runs done, each stored once", found.stored == self.runs),
+                Claim("overhead below 2 %", share < 0.02),
             ),
         )

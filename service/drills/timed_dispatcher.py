@@ -30,5 +30,5 @@ def _timed_claim(queue: RunQueue, *arguments: Any, **options: Any) -> list[Lease
 if __name__ == "__main__":
     from service.dispatcher.process import dispatch
 
-    RunQueue.claim = _timed_claim  # type: ignore[method-assign]
+    setattr(RunQueue, "claim", _timed_claim)  # noqa: B010 - mypy refuses the assignment
     sys.exit(dispatch(Settings()))

@@ -33,9 +33,7 @@ class Database:
             options["connect_args"] = {"timeout": BUSY_TIMEOUT_MS / 1000}
         else:
             options["connect_args"] = {"connect_timeout": CONNECT_TIMEOUT_S}
-        self.engine: Engine = create_engine(
-            self.url, json_serializer=_to_json, json_deserializer=from_json, **options
-        )
+        self.engine: Engine = create_engine(self.url, json_serializer=_to_json, json_deserializer=from_json, **options)
         if self.is_sqlite:
             event.listen(self.engine, "connect", _prepare_sqlite)
             if foreign_keys:

@@ -181,9 +181,7 @@ def final_state(runs: dict[str, int]) -> GridState:
     return GridState.DONE
 
 
-def new_event(
-    grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any
-) -> dict[str, Any]:
+def new_event(grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any) -> dict[str, Any]:
     """A row of the outbox."""
     return {"grid_id": grid_id, "run_id": run_id, "kind": kind, "detail": detail, "created_at": now}
 

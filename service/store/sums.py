@@ -16,7 +16,10 @@ from sqlalchemy.dialects import postgresql, sqlite
 from service.payload import ESTIMATES, QUANTITIES
 from service.store.tables import COUNTED, GROUP_COLUMNS, grid_sum, input_sum
 
-_INSERT: dict[str, Callable[[Table], Any]] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
+_INSERT: dict[str, Callable[[Table], sqlite.Insert | postgresql.Insert]] = {
+    "sqlite": sqlite.insert,
+    "postgresql": postgresql.insert,
+}
 
 
 def add_to_sums(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:

@@ -55,9 +55,7 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
     return _grid_view(row, runs, state, rate, left)
 
 
-def _grid_view(
-    row: Row[Any], runs: RunCounts, state: GridState, rate: float | None, left: float | None
-) -> GridView:
+def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | None, left: float | None) -> GridView:
     return GridView(
         id=row.id,
         name=row.name,

@@ -44,7 +44,7 @@ class Answered:
 
     def add_done_callback(self, told: Callable[[Any], None]) -> None:
         self._told = told
-        if self.done() and self.status != "lost" and self.status != "cancelled":
+        if self.done() and self.status not in {"lost", "cancelled"}:
             told(self)
 
     def answer(self, folder: Path) -> None:
