@@ -166,8 +166,8 @@ class WorkerKills(Drill):
         worst = max((ends["worker_lost"] for ends in found.charged.values()), default=0)
         return Report(
             self.name,
-            f"{self.runs} runs of {self.sleep_s:g} s, {self.workers} local workers, one killed every {self.every_s:g} s, "
-            f"{ground.backend}",
+            f"{self.runs} runs of {self.sleep_s:g} s, {self.workers} local workers, "
+            f"one killed every {self.every_s:g} s, {ground.backend}",
             (
                 Figure("kills", len(kills)),
                 Figure("seconds a kill", took / max(len(kills), 1), "s"),
