@@ -161,15 +161,19 @@ class Queue(RuleBasedStateMachine):
 
     @rule(target=dead, lease=consumes(leases))
     def finish(self, lease: Lease) -> Lease:
-        found = self.valid(lease)
-        assert self.queue.store(lease, result_of(lease)) is (Stored.STALE_SAME if found is None else Stored.STORED)
-        if found is not None:
-            self.end(found, DONE)
+        self.a_result_comes(lease)
         return lease
 
     @rule(lease=dead)
     def a_late_result(self, lease: Lease) -> None:
-        assert self.queue.store(lease, result_of(lease)) is Stored.STALE_SAME
+        """Nothing but a lease that nobody has ended yet, though its dispatcher has crashed, takes it."""
+        self.a_result_comes(lease)
+
+    def a_result_comes(self, lease: Lease) -> None:
+        found = self.valid(lease)
+        assert self.queue.store(lease, result_of(lease)) is (Stored.STALE_SAME if found is None else Stored.STORED)
+        if found is not None:
+            self.end(found, DONE)
 
     @rule(
         target=dead,
