@@ -22,7 +22,7 @@ _OUR_RULES = {
     "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
     "DASK_DISTRIBUTED__SCHEDULER__WORK_STEALING": "false",
 }
-_CONNECT_S = 15
+_CONNECT_S = 5  # a stop has to wait for it
 _STOP_S = 5.0
 
 

@@ -209,3 +209,15 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     with np.load(store.path(payload.products.key), allow_pickle=False) as arrays:
         assert set(arrays) == {"image", "model", "names"}
         assert arrays["image"].shape == (4, 5)
+
+
+def test_a_worker_is_greeted_with_its_engine_one_thread_and_warm_kernels() -> None:
+    """In a process of its own, as a worker started elsewhere is: without any of the variables that pin threads."""
+    code = (
+        "from service.worker import greet; said = greet('service.worker:execute'); "
+        "print(said.engine, set(said.threads.values()), f'{said.warm_s:.1f}')"
+    )
+    plain = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=plain, capture_output=True, text=True, check=True)
+    print(f"warm after {done.stdout.split()[-1]} s")
+    assert done.stdout.split()[:2] == [engine.engine_digest(), "{1}"]

@@ -14,6 +14,7 @@ import pytest
 from sqlalchemy import func, select
 
 from service.store.database import Database
+from service.store.leadership import Leadership
 from service.store.tables import attempt, result
 from tests.service.conftest import new_database
 from tests.service.plans import body
@@ -178,3 +179,39 @@ def test_a_second_dispatcher_stands_by_and_claims_nothing(tmp_path: Path) -> Non
         _, said = standby.communicate(timeout=20)
         assert standby.returncode == 0
         assert "leading" not in said
+
+
+def test_a_standby_takes_over_from_a_leader_that_is_killed(tmp_path: Path) -> None:
+    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0.2") as service:
+        standby = subprocess.Popen(
+            [sys.executable, "-m", "service.dispatcher"],
+            cwd=ROOT,
+            env=service.environment,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        database = Database(f"sqlite:///{tmp_path / 'data' / 'hostlens.sqlite'}")
+        leadership = Leadership(database)
+        # Time to stand by: it asks every second, the supervisor starts another only after the first has ended.
+        time.sleep(3)
+        grid = service.client.submit(body(30))
+        eventually(lambda: service.client.status(grid.id).counts.done > 2, what="progress")
+        first = leadership.view()
+        leader = service.child("service.dispatcher")
+        assert first is not None
+        assert leader is not None
+        if f"|{standby.pid}|" in first.holder:
+            os.kill(standby.pid, signal.SIGKILL)
+        else:
+            leader.kill()
+        view = eventually(
+            lambda: (now := leadership.alive()) and now.generation > first.generation and now, 10, "a new leader"
+        )
+        assert view.holder != first.holder
+        ended = service.client.wait(grid.id, timeout_s=60)
+        assert ended.counts.done == 30
+        assert stored_once(database, grid.id) == 30
+        database.close()
+        if standby.poll() is None:
+            standby.terminate()
+        standby.wait(timeout=20)
