@@ -183,9 +183,11 @@ class Installation:
 
     def kill_all(self) -> None:
         """End every process that is left, at once."""
-        for process in self.processes():
+        left = self.processes()
+        for process in left:
             with suppress(psutil.Error):
                 process.kill()
+        psutil.wait_procs(left, timeout=10)
         for started in self.started:
             started.wait(timeout=20)
         self.client.__exit__()

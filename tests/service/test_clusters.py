@@ -43,8 +43,8 @@ class Apart:
             "DATA_DIR": str(folder / "data"),
             "SCHEDULER_ADDRESS": f"{'tls' if tls else 'tcp'}://127.0.0.1:{self.port}",
             "TASK": "tests.service.tasks:fast",
-            "TEST_SLEEP": "0.3",
-            "TEST_LOG": str(self.executions),
+            "DRILL_SLEEP": "0.3",
+            "DRILL_LOG": str(self.executions),
             "RECONCILE_S": "1",
             "RETRY_DELAY_S": "0.2",
         }
@@ -58,7 +58,7 @@ class Apart:
             "PYTHONPATH": str(ROOT),
             **{f"HOSTLENS_{name}": value for name, value in settings.items()},
         }
-        self.settings = Settings(**{name.lower(): value for name, value in settings.items() if "TEST_" not in name})
+        self.settings = Settings(**{name.lower(): value for name, value in settings.items() if "DRILL_" not in name})
 
     def start(self, *command: str) -> subprocess.Popen[bytes]:
         with (self.folder / "log").open("ab") as log:

@@ -143,7 +143,7 @@ class ShakyQueue(RunQueue):
 
 @pytest.fixture(autouse=True)
 def no_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOSTLENS_TEST_SLEEP", "0")
+    monkeypatch.setenv("HOSTLENS_DRILL_SLEEP", "0")
 
 
 @pytest.fixture
