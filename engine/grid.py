@@ -11,7 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from engine.catalogue import load_system, read_catalogue
 from engine.errors import SpecError
-from engine.spec import Analysis, Host, Identifier, Magnitude, NoiseLevel, Radius, Realization, SersicIndex
+from engine.spec import Analysis, Host, Identifier, Magnitude, NoiseLevel, Optics, Radius, Realization, SersicIndex
 
 PAPER = "h0licow-vi"
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -35,6 +35,7 @@ class Grid:
     l_eta: tuple[float, ...] | None = None
     mass_model: Identifier = "recommended"
     noise_level: NoiseLevel = "author"
+    optics: Optics | None = None
     seed: Annotated[int, Field(ge=0, le=2**62)] = 0
     replicates: Annotated[int, Field(ge=1, le=100_000)] = 1
     analysis: Analysis = Field(default_factory=Analysis)
@@ -66,6 +67,7 @@ def expand(grid: Grid) -> tuple[GridRun, ...]:
             host=host,
             seed=grid.seed + replicate,
             noise_level=grid.noise_level,
+            optics=grid.optics,
             mass_model=grid.mass_model,
             analysis=grid.analysis,
         )

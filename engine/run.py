@@ -41,7 +41,7 @@ from engine.result import (
 )
 from engine.scene import build_scene
 from engine.simulation import simulate
-from engine.spec import Analysis, Realization
+from engine.spec import NOMINAL_OPTICS, Analysis, Realization
 
 Progress = Callable[[str, float], None]
 STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
@@ -285,6 +285,9 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
     warnings = found.warnings
     if noise.level != noise.requested:
         warnings = (*warnings, f"noise: camera has no level {noise.requested!r}, {noise.level!r} was used")
+    if scene.optics != NOMINAL_OPTICS:
+        spoilt = f"{scene.optics.defocus_nm:g} nm of defocus and {scene.optics.jitter:g} arcsec of jitter"
+        warnings = (*warnings, f"optics: simulated with {spoilt}, analysed with the nominal PSF")
     return RunResult(
         realization_digest=realization.digest,
         engine_digest=engine_digest(),

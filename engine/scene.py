@@ -13,7 +13,7 @@ from engine.errors import SpecError
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.spec import AgnImage, Camera, LensSystem, MassModel, Realization, SersicLight
+from engine.spec import NOMINAL_OPTICS, AgnImage, Camera, LensSystem, MassModel, Optics, Realization, SersicLight
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class Scene:
     host: SersicProfile
     deflector: SersicProfile | None
     agn: tuple[PointSource, ...]
+    optics: Optics = NOMINAL_OPTICS
 
 
 def resolve_system(realization: Realization) -> LensSystem:
@@ -130,4 +131,12 @@ def build_scene(realization: Realization) -> Scene:
     agn: tuple[PointSource, ...] = ()
     if system.agn:
         agn = place_agn(solve_lens_equation(lens, source_x, source_y), system.agn, camera.zero_point)
-    return Scene(system=system, camera=camera, lens=lens, host=host, deflector=deflector, agn=agn)
+    return Scene(
+        system=system,
+        camera=camera,
+        lens=lens,
+        host=host,
+        deflector=deflector,
+        agn=agn,
+        optics=realization.optics or NOMINAL_OPTICS,
+    )

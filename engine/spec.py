@@ -187,6 +187,21 @@ class Host:
 
 
 @dataclass(frozen=True, config=_STRICT)
+class Optics:
+    """How the telescope departs from its nominal PSF, for simulating a PSF that the analysis does not know.
+
+    ``defocus_nm`` is the focus error [nm rms of wavefront]; 1 micron of HST's secondary mirror is 6 nm, its breathing
+    about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis].
+    """
+
+    defocus_nm: Annotated[float, Field(ge=-500.0, le=500.0)] = 0.0
+    jitter: Annotated[float, Field(ge=0.0, le=0.5)] = 0.0
+
+
+NOMINAL_OPTICS = Optics()
+
+
+@dataclass(frozen=True, config=_STRICT)
 class Analysis:
     """How a run is analysed. Nothing here knows the truth.
 
@@ -218,7 +233,8 @@ class Realization:
     """One run of the study: a system at one slope, a host, a noise level, a study seed and how it is analysed.
 
     ``system`` names a catalogue entry or is a :class:`LensSystem` of the user's own; ``camera`` likewise, and is the
-    system's own where None. Equal realizations have equal digests and give the same bits.
+    system's own where None. ``optics`` spoils the PSF of the simulation, not the one that the analysis is given.
+    Equal realizations have equal digests and give the same bits.
     """
 
     system: Identifier | LensSystem
@@ -228,6 +244,7 @@ class Realization:
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
     camera: Identifier | Camera | None = None
+    optics: Optics | None = None
     analysis: Analysis = Field(default_factory=Analysis)
 
     def to_dict(self) -> dict[str, Any]:
@@ -235,6 +252,9 @@ class Realization:
         dumped = _REALIZATION.dump_python(self, mode="json")
         if not isinstance(dumped, dict):  # pragma: no cover - a dataclass always dumps to a mapping
             raise TypeError(type(dumped))
+        # Left out where it is not used, so that realizations from before there was such a field keep their digests.
+        if dumped["optics"] is None:
+            del dumped["optics"]
         return dumped
 
     @property

@@ -16,6 +16,7 @@ from engine import (
     Grid,
     GridRun,
     NoiseLevel,
+    Optics,
     camera_names,
     engine_digest,
     expand,
@@ -78,6 +79,7 @@ class GridRequest(BaseModel):
     l_eta: Slopes | None = None
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
+    optics: Optics | None = None
     seed: Annotated[int, Strict(), Field(ge=0, le=2**62)] = 0
     replicates: Annotated[int, Strict(), Field(ge=1, le=100_000)] = 1
     analysis: AnalysisBody | None = None
@@ -129,6 +131,7 @@ def _grid(request: GridRequest, replicates: int) -> Grid:
         preset=request.preset,
         mass_model=request.mass_model,
         noise_level=request.noise_level,
+        optics=request.optics,
         seed=request.seed,
         replicates=replicates,
         analysis=Analysis(**changes),

@@ -1,9 +1,9 @@
-"""All images of a point source: triangles that hold the source, refined near critical curves, polished by Newton.
+"""All images of a point source: cells of the image plane that may hold one, cut finer, and Newton from each.
 
-The image plane is tiled with triangles. A triangle whose mapped image holds the source holds an image; a cell whose
-corners differ in the sign of the Jacobian determinant, or whose determinant is small against its change across the
-cell, is cut finer first, because two images may lie in it with no triangle telling. The polished images are merged
-where they coincide.
+A cell is kept while the source lies within the mapped cell, with a margin for what the mapping's curvature can hide.
+It is cut until the mapping is nearly linear across it and the Jacobian determinant has one sign, because two images
+may lie on either side of a critical curve; from the corners and the centre of what is left, Newton's method finds the
+images to rounding. Images found twice are merged.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engine.compiled import kernel
+from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import LensEquationError
 from engine.lensing.power_law import (
@@ -24,9 +24,16 @@ from engine.lensing.power_law import (
     magnification,
 )
 
-_CELLS = 80
-_DEPTH = 7
+_COARSE = 0.3
+"""Side of the largest cells over their distance from the lens, times sqrt(q): the scale on which deflection varies."""
+_CORE = 0.1
+"""Distance from the lens [theta_E] below which cells need not shrink with it any more."""
+_CURVATURE = 0.05
+"""Departure from linearity across a cell, over the extent of the mapped cell, at which it is cut."""
+_DEPTH = 12
+"""Halvings of a cell beside a critical curve: 1e-5 theta_E."""
 _NEWTON_STEPS = 60
+_MOST_CELLS = 20_000
 
 
 @dataclass(frozen=True)
@@ -38,20 +45,11 @@ class LensedImage:
     magnification: float
 
 
-@kernel
-def _source_and_determinant(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float, float]:
-    ax, ay = deflect_point(x, y, p, a)
+@inlined_kernel
+def _determinant(x: float, y: float, p: FloatArray, a: FloatArray) -> float:
+    """Determinant of the Jacobian of the lens equation: the inverse magnification."""
     kappa, g1, g2 = jacobian_point(x, y, p, a)
-    return x - ax, y - ay, (1.0 - kappa) ** 2 - g1 * g1 - g2 * g2
-
-
-@kernel
-def _holds(ax: float, ay: float, bx: float, by: float, cx: float, cy: float) -> bool:
-    """Whether the triangle a, b, c holds the origin."""
-    d1 = ax * by - ay * bx
-    d2 = bx * cy - by * cx
-    d3 = cx * ay - cy * ax
-    return (d1 >= 0.0 and d2 >= 0.0 and d3 >= 0.0) or (d1 <= 0.0 and d2 <= 0.0 and d3 <= 0.0)
+    return (1.0 - kappa) ** 2 - g1 * g1 - g2 * g2
 
 
 @kernel
@@ -63,6 +61,8 @@ def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArr
     for _ in range(_NEWTON_STEPS):
         if error < 1e-14:
             break
+        if x == p[5] and y == p[6]:
+            return x, y, False
         kappa, g1, g2 = jacobian_point(x, y, p, a)
         determinant = (1.0 - kappa) ** 2 - g1 * g1 - g2 * g2
         if determinant == 0.0:
@@ -86,55 +86,111 @@ def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArr
     return x, y, error < 1e-12
 
 
+@inlined_kernel
+def _is_coarse(x: float, y: float, side: float, theta_E: float, p: FloatArray) -> bool:
+    """Whether a cell is large against its distance from the lens, on whose scale the deflection varies."""
+    distance = max(math.hypot(x - p[5], y - p[6]) - 0.71 * side, _CORE * theta_E)
+    return side > _COARSE * math.sqrt(p[1]) * distance
+
+
 @kernel
-def _candidates(sx: float, sy: float, half: float, p: FloatArray, a: FloatArray, found: FloatArray) -> int:
-    """Centroids of the triangles that hold the source, written into ``found`` (n, 2); how many."""
-    corners = np.empty((4, 3))
-    stack = np.empty((4 * _DEPTH + 8, 3))
+def _map_cell(x: float, y: float, side: float, sx: float, sy: float, p: FloatArray, a: FloatArray) -> tuple[bool, bool]:
+    """Whether the source may lie in a mapped cell, and whether the cell is simple: nearly linear, of one parity."""
+    ax, ay = deflect_point(x, y, p, a)
+    cx, cy = x - ax, y - ay
+    corners = np.empty((4, 2))
+    longest, long_x, long_y = 0.0, 1.0, 0.0
+    for k in range(4):
+        u, v = x + ((k % 2) - 0.5) * side, y + ((k // 2) - 0.5) * side
+        ax, ay = deflect_point(u, v, p, a)
+        dx, dy = u - ax - cx, v - ay - cy
+        corners[k, 0], corners[k, 1] = dx, dy
+        length = math.hypot(dx, dy)
+        if length > longest:
+            longest, long_x, long_y = length, dx / length, dy / length
+    # Beside a critical curve the mapped cell is a sliver: its extent is measured along and across its long side.
+    extent_along, extent_across = 0.0, 0.0
+    for k in range(4):
+        extent_along = max(extent_along, abs(corners[k, 0] * long_x + corners[k, 1] * long_y))
+        extent_across = max(extent_across, abs(corners[k, 1] * long_x - corners[k, 0] * long_y))
+    # Opposite corners of a linear map cancel. What is left holds all second derivatives of the lens equation, of which
+    # there are only four, being third derivatives of the potential.
+    bend = 0.5 * max(
+        math.hypot(corners[0, 0] + corners[3, 0], corners[0, 1] + corners[3, 1]),
+        math.hypot(corners[1, 0] + corners[2, 0], corners[1, 1] + corners[2, 1]),
+    )
+    along = abs((sx - cx) * long_x + (sy - cy) * long_y)
+    across = abs((sy - cy) * long_x - (sx - cx) * long_y)
+    if along > 1.05 * extent_along + 2.0 * bend or across > 1.05 * extent_across + 2.0 * bend:
+        return False, False
+    low = high = _determinant(x, y, p, a)
+    for k in range(4):
+        value = _determinant(x + ((k % 2) - 0.5) * side, y + ((k // 2) - 0.5) * side, p, a)
+        low, high = min(low, value), max(high, value)
+    spread = high - low
+    one_parity = low - 0.5 * spread > 0.0 or high + 0.5 * spread < 0.0
+    return True, one_parity and bend <= _CURVATURE * extent_along
+
+
+@kernel
+def _candidates(
+    sx: float, sy: float, half: float, theta_E: float, p: FloatArray, a: FloatArray, found: FloatArray
+) -> int:
+    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many there are."""
+    stack = np.empty((512, 4))
+    # Off the lens by an irrational part, so that no corner and no centre ever falls on it.
+    stack[0, 0], stack[0, 1] = p[5] + 0.0318309886 * half, p[6] + 0.0271828183 * half
+    stack[0, 2], stack[0, 3] = 2.1 * half, 0.0
+    top = 1
     n = 0
-    side0 = 2.0 * half / _CELLS
-    # An irrational offset keeps corners off the centre of the lens and off symmetric points.
-    left = p[5] - half + 0.31830988618 * side0
-    bottom = p[6] - half + 0.27182818284 * side0
-    for j in range(-1, _CELLS):
-        for i in range(-1, _CELLS):
-            stack[0, 0], stack[0, 1], stack[0, 2] = left + i * side0, bottom + j * side0, 0.0
-            top = 1
-            while top > 0:
-                top -= 1
-                x0, y0, depth = stack[top, 0], stack[top, 1], stack[top, 2]
-                side = side0 * 0.5**depth
-                low, high = np.inf, -np.inf
-                for k in range(4):
-                    bx, by, determinant = _source_and_determinant(x0 + (k % 2) * side, y0 + (k // 2) * side, p, a)
-                    corners[k, 0], corners[k, 1], corners[k, 2] = bx - sx, by - sy, determinant
-                    low, high = min(low, determinant), max(high, determinant)
-                spread = high - low
-                near_critical = low - spread <= 0.0 <= high + spread
-                reach = 0.0
-                for k in range(1, 4):
-                    reach = max(reach, abs(corners[k, 0] - corners[0, 0]) + abs(corners[k, 1] - corners[0, 1]))
-                near_source = abs(corners[0, 0]) + abs(corners[0, 1]) <= 4.0 * reach + 0.1 * side
-                holds_centre = x0 <= p[5] <= x0 + side and y0 <= p[6] <= y0 + side
-                if depth < _DEPTH and ((near_critical and near_source) or holds_centre):
-                    for k in range(4):
-                        stack[top, 0] = x0 + 0.5 * (k % 2) * side
-                        stack[top, 1] = y0 + 0.5 * (k // 2) * side
-                        stack[top, 2] = depth + 1.0
-                        top += 1
-                    continue
-                for third in (0, 3):
-                    if n < found.shape[0] and _holds(
-                        corners[third, 0],
-                        corners[third, 1],
-                        corners[1, 0],
-                        corners[1, 1],
-                        corners[2, 0],
-                        corners[2, 1],
-                    ):
-                        weight = (third // 3) * side / 3.0 + side / 3.0
-                        found[n, 0], found[n, 1] = x0 + weight, y0 + weight
-                        n += 1
+    while top > 0:
+        top -= 1
+        x, y, side, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
+        cut = _is_coarse(x, y, side, theta_E, p)
+        if not cut:
+            near, simple = _map_cell(x, y, side, sx, sy, p, a)
+            if not near:
+                continue
+            cut = not simple and depth < _DEPTH
+            depth += 1.0
+        if cut:
+            for k in range(4):
+                stack[top, 0] = x + 0.5 * ((k % 2) - 0.5) * side
+                stack[top, 1] = y + 0.5 * ((k // 2) - 0.5) * side
+                stack[top, 2], stack[top, 3] = 0.5 * side, depth
+                top += 1
+        else:
+            if n < found.shape[0]:
+                found[n, 0], found[n, 1], found[n, 2] = x, y, side
+            n += 1
+    return n
+
+
+@kernel
+def _images(
+    candidates: FloatArray, sx: float, sy: float, theta_E: float, p: FloatArray, a: FloatArray, roots: FloatArray
+) -> int:
+    """Distinct images reached from the candidate cells, written into ``roots`` (n, 2); how many."""
+    n = 0
+    for c in range(candidates.shape[0]):
+        for k in range(5):
+            shift = 0.0 if k == 4 else 0.5 * candidates[c, 2]
+            x0 = candidates[c, 0] + (2 * (k % 2) - 1) * shift
+            y0 = candidates[c, 1] + (2 * (k // 2 % 2) - 1) * shift
+            x, y, converged = _polish(x0, y0, sx, sy, p, a)
+            if not converged:
+                continue
+            known = False
+            determinant = _determinant(x, y, p, a)
+            for m in range(n):
+                distance = math.hypot(x - roots[m, 0], y - roots[m, 1])
+                other = _determinant(roots[m, 0], roots[m, 1], p, a)
+                # On a caustic Newton stops anywhere within the square root of rounding of a double root.
+                blurred = distance < 1e-5 * theta_E and determinant * other > 0.0 and abs(determinant) < 1e-4
+                known = known or blurred or distance < 1e-7 * theta_E
+            if not known and n < roots.shape[0]:
+                roots[n, 0], roots[n, 1] = x, y
+                n += 1
     return n
 
 
@@ -169,13 +225,12 @@ def solve_lens_equation(
         half *= 1.3
         if half > 1e4 * reach + 10.0 * offset:
             raise LensEquationError(f"slope {lens.slope} and shear {shear} leave the image plane unbounded")
-    found = np.empty((256, 2))
-    n = _candidates(source_x, source_y, 1.05 * half, p, a, found)
-    roots: list[tuple[float, float]] = []
-    for x0, y0 in found[:n]:
-        x, y, converged = _polish(x0, y0, source_x, source_y, p, a)
-        if converged and all(math.hypot(x - u, y - v) > 1e-7 * lens.theta_E for u, v in roots):
-            roots.append((x, y))
+    cells = np.empty((_MOST_CELLS, 3))
+    n = _candidates(source_x, source_y, half, lens.theta_E, p, a, cells)
+    if n > _MOST_CELLS:
+        raise LensEquationError(f"the source at ({source_x}, {source_y}) behind {lens} is too close to a caustic")
+    found = np.empty((16, 2))
+    roots = found[: _images(cells[:n], source_x, source_y, lens.theta_E, p, a, found)]
     images = []
     for x, y in roots:
         mu = float(magnification(lens, np.array(x), np.array(y)))

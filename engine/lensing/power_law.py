@@ -128,9 +128,11 @@ def deflect_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[flo
     return c * ar - s * ai + shear_x, s * ar + c * ai + shear_y
 
 
-@kernel
-def trace_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray) -> None:
-    """Source positions of image positions, written into ``bx`` and ``by`` (all one-dimensional, same length).
+@inlined_kernel
+def _map_rays(
+    x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray, traced: bool
+) -> None:
+    """Source positions (``traced``) or deflections of image positions, written into ``bx`` and ``by``.
 
     Works in blocks whose loops over points are innermost, so that the compiler can vectorise the series.
     """
@@ -176,19 +178,35 @@ def trace_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: F
             ar = radius[i] * (cos1[i] * sr[i] - sin1[i] * si[i])
             ai = radius[i] * (cos1[i] * si[i] + sin1[i] * sr[i])
             xi, yi = x[start + i], y[start + i]
-            bx[start + i] = xi - (c * ar - s * ai + p[7] * xi + p[8] * yi)
-            by[start + i] = yi - (s * ar + c * ai + p[8] * xi - p[7] * yi)
+            alpha_x = c * ar - s * ai + p[7] * xi + p[8] * yi
+            alpha_y = s * ar + c * ai + p[8] * xi - p[7] * yi
+            bx[start + i] = xi - alpha_x if traced else alpha_x
+            by[start + i] = yi - alpha_y if traced else alpha_y
+
+
+@kernel
+def trace_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray) -> None:
+    """Source positions of image positions, written into ``bx`` and ``by`` (all one-dimensional, same length)."""
+    _map_rays(x, y, p, a, bx, by, True)
+
+
+@kernel
+def _deflect_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, ax: FloatArray, ay: FloatArray) -> None:
+    # Not x - (x - alpha): far from the lens that would lose the digits of alpha.
+    _map_rays(x, y, p, a, ax, ay, False)
 
 
 @inlined_kernel
 def jacobian_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float, float]:
-    """Convergence and shear (kappa, g1, g2) at one point, which must not be the centre of the lens.
+    """Convergence and shear (kappa, g1, g2) at one point; at the centre of the lens kappa is infinite.
 
     The deflection is homogeneous of degree 1 - t, so z kappa + z* gamma = (1 - t) alpha (Euler), which gives the
     shear from kappa and alpha without differences.
     """
     b, q, c, s, t = p[0], p[1], p[2], p[3], p[4]
     dx, dy = x - p[5], y - p[6]
+    if dx == 0.0 and dy == 0.0:
+        return np.inf, p[7], p[8]
     ax, ay = deflect_point(x, y, p, a)
     ax -= p[7] * x + p[8] * y
     ay -= p[8] * x - p[7] * y
@@ -208,34 +226,40 @@ def _convergence_and_shear(x: FloatArray, y: FloatArray, p: FloatArray, a: Float
         out[0, i], out[1, i], out[2, i] = jacobian_point(x[i], y[i], p, a)
 
 
+def _flat(x: FloatArray, y: FloatArray) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
+    """The common shape of two arrays, and both as contiguous vectors."""
+    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    return x.shape, np.ascontiguousarray(x).ravel(), np.ascontiguousarray(y).ravel()
+
+
 def deflection(lens: PowerLawLens, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Deflection angles [arcsec] at image positions [arcsec]; arrays of any one shape."""
-    bx, by = source_position(lens, x, y)
-    return np.asarray(x, dtype=np.float64) - bx, np.asarray(y, dtype=np.float64) - by
+    shape, x, y = _flat(x, y)
+    ax, ay = np.empty(x.size), np.empty(x.size)
+    _deflect_rays(x, y, *kernel_arguments(lens), ax, ay)
+    return ax.reshape(shape), ay.reshape(shape)
 
 
 def source_position(lens: PowerLawLens, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Source-plane positions [arcsec] of image positions [arcsec]; arrays of any one shape."""
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    shape, x, y = _flat(x, y)
     bx, by = np.empty(x.size), np.empty(x.size)
-    trace_rays(np.ascontiguousarray(x).ravel(), np.ascontiguousarray(y).ravel(), *kernel_arguments(lens), bx, by)
-    return bx.reshape(x.shape), by.reshape(x.shape)
+    trace_rays(x, y, *kernel_arguments(lens), bx, by)
+    return bx.reshape(shape), by.reshape(shape)
 
 
 def convergence_and_shear(
     lens: PowerLawLens, x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Convergence and total shear components at image positions away from the centre of the lens."""
-    x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    """Convergence and total shear components at image positions; at the centre of the lens the first is infinite."""
+    shape, x, y = _flat(x, y)
     out = np.empty((3, x.size))
-    _convergence_and_shear(
-        np.ascontiguousarray(x).ravel(), np.ascontiguousarray(y).ravel(), *kernel_arguments(lens), out
-    )
-    return out[0].reshape(x.shape), out[1].reshape(x.shape), out[2].reshape(x.shape)
+    _convergence_and_shear(x, y, *kernel_arguments(lens), out)
+    return out[0].reshape(shape), out[1].reshape(shape), out[2].reshape(shape)
 
 
 def magnification(lens: PowerLawLens, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Signed magnification 1 / [(1 - kappa)^2 - gamma^2]; infinite on a critical curve."""
+    """Signed magnification 1 / [(1 - kappa)^2 - gamma^2]: infinite on a critical curve, zero at the lens' centre."""
     kappa, gamma1, gamma2 = convergence_and_shear(lens, x, y)
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / ((1.0 - kappa) ** 2 - gamma1**2 - gamma2**2))

@@ -1,8 +1,9 @@
 """Pixel-integrated surface brightness of a Sersic profile, seen directly or through a lens.
 
-Each pixel is integrated by nested Gauss-Legendre rules: where the 2 x 2 and 3 x 3 rules disagree by more than the
-tolerance, or where the pixel may hold the cusp, it is split into four, and so on to ``MAX_DEPTH``. Refinement thus goes
-only where the ray-traced surface brightness varies.
+One ray is traced through the centre of each pixel. From the brightness there and at the neighbours, the mean over the
+pixel follows to fourth order, and the fourth order itself says how far it may be trusted. What is left, where the
+ray-traced surface brightness varies within a pixel or the cusp may lie between the rays, is refined one by one
+(:mod:`engine.light.refinement`).
 """
 
 from __future__ import annotations
@@ -10,139 +11,131 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from engine.compiled import inlined_kernel, kernel
+from engine.compiled import kernel
 from engine.conventions import FloatArray
-from engine.lensing.power_law import PowerLawLens, deflect_point
+from engine.errors import SpecError
+from engine.lensing.power_law import PowerLawLens, trace_rays
 from engine.lensing.power_law import kernel_arguments as lens_arguments
+from engine.light.brightness_bounds import brightness_range, length
+from engine.light.radial_table import brightness, tabulate, to_profile_axes
+from engine.light.refinement import Tracer, refine_pixels
 from engine.light.sersic import SersicProfile
 from engine.light.sersic import kernel_arguments as sersic_arguments
 
-MAX_DEPTH = 9
-"""Halvings of a pixel's side at most: 1/512 of a pixel resolves the cusp of n = 4 at r_eff of a pixel."""
-
-CUSP_DEPTH = 5
-"""Halvings down to which a cell that may hold the cusp is split whatever the rules say."""
-
 DEFAULT_TOLERANCE = 1e-4
-"""Estimated error of a pixel as a fraction of the brightest pixel at which it is no longer refined."""
+"""Estimated error of a pixel as a fraction of the brightest, and of all pixels together as a fraction of the flux."""
 
-_G2 = 0.5 / math.sqrt(3.0)
-_G3 = 0.5 * math.sqrt(0.6)
+MIN_TOLERANCE = 1e-8
+"""The radial table is good to 1e-7 at worst, mostly better; what is asked beyond that is not had."""
 
+_CLEARANCE = 2.0
+"""Distance of a pixel from the cusp in units of its size from which it may be trusted: the differences reach so far."""
 
-@inlined_kernel
-def _brightness(
-    x: float, y: float, light: FloatArray, lensed: bool, p: FloatArray, a: FloatArray
-) -> tuple[float, float]:
-    """Surface brightness at an image position, and the squared source-plane distance from the profile's centre."""
-    if lensed:
-        ax, ay = deflect_point(x, y, p, a)
-        x -= ax
-        y -= ay
-    dx, dy = x - light[7], y - light[8]
-    u = light[5] * dx + light[6] * dy
-    v = light[5] * dy - light[6] * dx
-    z = (light[4] * u * u + v * v / light[4]) * light[3]
-    return light[0] * math.exp(-light[1] * z ** light[2]), dx * dx + dy * dy
+_HALO = 2
+"""Pixels beyond the grid on each side that the differences need."""
 
 
-@kernel
-def _cell(
-    x: float, y: float, h: float, light: FloatArray, lensed: bool, p: FloatArray, a: FloatArray
-) -> tuple[float, float, float]:
-    """Flux of a square cell of side h by the 3 x 3 rule, its difference from the 2 x 2 rule, nearest distance^2."""
-    two = 0.0
-    for i in range(2):
-        for j in range(2):
-            value, _ = _brightness(x + (2 * i - 1) * _G2 * h, y + (2 * j - 1) * _G2 * h, light, lensed, p, a)
-            two += 0.25 * value
-    three = 0.0
-    nearest = np.inf
-    for i in range(-1, 2):
-        wi = 8.0 / 18.0 if i == 0 else 5.0 / 18.0
-        for j in range(-1, 2):
-            wj = 8.0 / 18.0 if j == 0 else 5.0 / 18.0
-            value, distance2 = _brightness(x + i * _G3 * h, y + j * _G3 * h, light, lensed, p, a)
-            three += wi * wj * value
-            nearest = min(nearest, distance2)
-    return three * h * h, abs(three - two) * h * h, nearest
+def _tracer(profile: SersicProfile, lens: PowerLawLens | None) -> Tracer:
+    """From image positions to the axes of the profile; without a lens nothing is deflected."""
+    light = sersic_arguments(profile)
+    if lens is None:
+        return lambda x, y: to_profile_axes(x, y, light)
+    series = lens_arguments(lens)
 
+    def trace(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        bx, by = np.empty(x.size), np.empty(x.size)
+        trace_rays(x, y, *series, bx, by)
+        return to_profile_axes(bx, by, light)
 
-@inlined_kernel
-def _is_rough(flux: float, difference: float, nearest: float, side: float, tolerance: float, depth: float) -> bool:
-    """Whether a cell must be split: the rules disagree, or it may hold the cusp, which hides from both."""
-    return difference > tolerance or (nearest < side * side and flux > tolerance and depth < CUSP_DEPTH)
+    return trace
 
 
 @kernel
-def _refine_pixel(
-    x: float,
-    y: float,
-    h: float,
-    tolerance: float,
-    light: FloatArray,
-    lensed: bool,
-    p: FloatArray,
-    a: FloatArray,
-    stack: FloatArray,
-) -> float:
-    """Flux of one pixel by adaptive splitting; ``stack`` is scratch of shape (4 MAX_DEPTH + 4, 3): x, y, depth."""
+def _average(
+    u: FloatArray, v: FloatArray, f: FloatArray, table: FloatArray, mean: FloatArray, error: FloatArray
+) -> None:
+    """Mean brightness over each pixel from its central ray and its neighbours', and an estimate of its error.
+
+    The mean of f over a cell of unit side is f + (dxx + dyy)/24 - 17 (dxxxx + dyyyy)/5760 + dxxyy/576 in central
+    differences, up to sixth order. ``u``, ``v``, ``f`` have a halo of two pixels.
+    """
+    for j in range(mean.shape[0]):
+        for i in range(mean.shape[1]):
+            r, c = j + _HALO, i + _HALO
+            f0 = f[r, c]
+            sides_x, sides_y = f[r, c - 1] + f[r, c + 1], f[r - 1, c] + f[r + 1, c]
+            corners = f[r - 1, c - 1] + f[r - 1, c + 1] + f[r + 1, c - 1] + f[r + 1, c + 1]
+            xxxx = f[r, c - 2] + f[r, c + 2] - 4.0 * sides_x + 6.0 * f0
+            yyyy = f[r - 2, c] + f[r + 2, c] - 4.0 * sides_y + 6.0 * f0
+            xxyy = corners - 2.0 * (sides_x + sides_y) + 4.0 * f0
+            value = f0 + (sides_x + sides_y - 4.0 * f0) / 24.0 - (xxxx + yyyy) * (17.0 / 5760.0) + xxyy / 576.0
+            fourth = (abs(xxxx) + abs(yyyy)) * (17.0 / 5760.0) + abs(xxyy) / 576.0
+            # Differences over two pixels, carried on to half a pixel.
+            u0, v0 = u[r, c], v[r, c]
+            xx = length(u[r, c + 1] + u[r, c - 1] - 2.0 * u0, v[r, c + 1] + v[r, c - 1] - 2.0 * v0)
+            yy = length(u[r + 1, c] + u[r - 1, c] - 2.0 * u0, v[r + 1, c] + v[r - 1, c] - 2.0 * v0)
+            xy = length(
+                u[r + 1, c + 1] - u[r + 1, c - 1] - u[r - 1, c + 1] + u[r - 1, c - 1],
+                v[r + 1, c + 1] - v[r + 1, c - 1] - v[r - 1, c + 1] + v[r - 1, c - 1],
+            )
+            least, most, smooth = brightness_range(
+                u0,
+                v0,
+                0.25 * (u[r, c + 1] - u[r, c - 1]),
+                0.25 * (v[r, c + 1] - v[r, c - 1]),
+                0.25 * (u[r + 1, c] - u[r - 1, c]),
+                0.25 * (v[r + 1, c] - v[r - 1, c]),
+                0.125 * xx + 0.125 * yy + 0.0625 * xy,
+                _CLEARANCE,
+                table,
+            )
+            mean[j, i] = min(max(value, least), most)
+            error[j, i] = min(fourth, most - least) if smooth else most - least
+
+
+@kernel
+def _greatest_of_neighbours(error: FloatArray) -> FloatArray:
+    """For each pixel the greatest error of the 3 x 3 about it: a single difference may vanish by accident."""
+    out = error.copy()
+    rows, columns = error.shape
+    for j in range(rows):
+        for i in range(columns):
+            for k in range(max(j - 1, 0), min(j + 2, rows)):
+                for m in range(max(i - 1, 0), min(i + 2, columns)):
+                    out[j, i] = max(out[j, i], error[k, m])
+    return out
+
+
+@kernel
+def _sum_below(error: FloatArray, limit: float) -> float:
     total = 0.0
-    stack[0, 0], stack[0, 1], stack[0, 2] = x, y, 0.0
-    top = 1
-    while top > 0:
-        top -= 1
-        cx, cy, depth = stack[top, 0], stack[top, 1], stack[top, 2]
-        shrink = 0.5**depth
-        side = h * shrink
-        flux, difference, nearest = _cell(cx, cy, side, light, lensed, p, a)
-        # Cells along a line through the cusp or an arc: their errors add up, so each may have its share only.
-        if depth == 0.0 or (
-            depth < MAX_DEPTH and _is_rough(flux, difference, nearest, side, tolerance * shrink, depth)
-        ):
-            quarter = 0.25 * side
-            for i in range(2):
-                for j in range(2):
-                    stack[top, 0] = cx + (2 * i - 1) * quarter
-                    stack[top, 1] = cy + (2 * j - 1) * quarter
-                    stack[top, 2] = depth + 1.0
-                    top += 1
-        else:
-            total += flux
+    for j in range(error.shape[0]):
+        for i in range(error.shape[1]):
+            total += error[j, i] if error[j, i] <= limit else 0.0
     return total
 
 
-@kernel
-def _render(
-    xs: FloatArray,
-    ys: FloatArray,
-    h: float,
-    relative: float,
-    light: FloatArray,
-    lensed: bool,
-    p: FloatArray,
-    a: FloatArray,
-) -> FloatArray:
-    out = np.empty((ys.size, xs.size))
-    difference = np.empty((ys.size, xs.size))
-    nearest = np.empty((ys.size, xs.size))
-    stack = np.empty((4 * MAX_DEPTH + 4, 3))
-    top_i, top_j = 0, 0
-    for j in range(ys.size):
-        for i in range(xs.size):
-            out[j, i], difference[j, i], nearest[j, i] = _cell(xs[i], ys[j], h, light, lensed, p, a)
-            if out[j, i] > out[top_j, top_i]:
-                top_i, top_j = i, j
-    # A point of the rule that meets the cusp makes its pixel too bright by far: measure the peak properly.
-    peak = out[top_j, top_i]
-    peak = min(peak, _refine_pixel(xs[top_i], ys[top_j], h, relative * peak, light, lensed, p, a, stack))
-    tolerance = relative * peak
-    for j in range(ys.size):
-        for i in range(xs.size):
-            if _is_rough(out[j, i], difference[j, i], nearest[j, i], h, tolerance, 0.0):
-                out[j, i] = _refine_pixel(xs[i], ys[j], h, tolerance, light, lensed, p, a, stack)
-    return out
+def _axis_with_halo(centres: FloatArray, side: float, name: str) -> FloatArray:
+    step = math.copysign(side, centres[-1] - centres[0])
+    if not np.allclose(np.diff(centres), step, rtol=0.0, atol=1e-6 * side):
+        raise SpecError(name, centres, f"centres that are pixel_scale = {side} apart")
+    beyond = step * np.arange(1, _HALO + 1)
+    return np.concatenate([centres[0] - beyond[::-1], centres, centres[-1] + beyond])
+
+
+def _first_pass(
+    x: FloatArray, y: FloatArray, side: float, trace: Tracer, table: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Flux of each pixel from one ray a pixel, and an estimate of its error; both (ny, nx), for unit flux."""
+    columns, rows = _axis_with_halo(x, side, "x"), _axis_with_halo(y, side, "y")
+    shape = (rows.size, columns.size)
+    u, v = trace(np.tile(columns, rows.size), np.repeat(rows, columns.size))
+    f = brightness(u, v, table)
+    mean, error = np.empty((y.size, x.size)), np.empty((y.size, x.size))
+    _average(u.reshape(shape), v.reshape(shape), f.reshape(shape), table, mean, error)
+    return mean * side**2, np.asarray(_greatest_of_neighbours(error)) * side**2
 
 
 def render_sersic(
@@ -160,43 +153,50 @@ def render_sersic(
     profile : SersicProfile
         In the source plane where a lens is given, else in the image plane.
     x, y : arrays of shape (nx,), (ny,)
-        Centres of the pixels [arcsec].
+        Centres of the pixels [arcsec], ``pixel_scale`` apart.
     pixel_scale : float
         Side of a pixel [arcsec].
     lens : PowerLawLens, optional
         The lens in front of the profile.
     tolerance : float
-        Estimated error of a pixel at which it is no longer refined, as a fraction of the brightest pixel.
+        Estimated error at which no pixel is refined any further: of a pixel as a fraction of the brightest pixel, and
+        of all pixels together as a fraction of the flux in the image.
 
     Returns
     -------
     array of shape (ny, nx)
+
+    Raises
+    ------
+    SpecError
+        Where the pixels are not ``pixel_scale`` apart, or the tolerance is below what the radial table can give.
     """
-    if lens is None:
-        p, a = np.zeros(9), np.ones(1)
-    else:
-        p, a = lens_arguments(lens)
-    light = sersic_arguments(profile)
-    return np.asarray(_render(x, y, pixel_scale, tolerance, light, lens is not None, p, a))
+    if not MIN_TOLERANCE <= tolerance < 1:
+        raise SpecError("tolerance", tolerance, f"at least {MIN_TOLERANCE} and below 1")
+    x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    trace, table = _tracer(profile, lens), tabulate(profile)
+    image, error = _first_pass(x, y, pixel_scale, trace, table)
 
+    def refine(chosen: NDArray[np.intp], absolute: float, relative: float) -> None:
+        j, i = np.unravel_index(chosen, image.shape)
+        image[j, i] = refine_pixels(x[i], y[j], pixel_scale, trace, table, absolute=absolute, relative=relative)
+        error[j, i] = 0.0
 
-@kernel
-def _sample(
-    xs: FloatArray, ys: FloatArray, h: float, subrays: int, light: FloatArray, p: FloatArray, a: FloatArray
-) -> FloatArray:
-    out = np.empty((ys.size, xs.size))
-    area = h * h / (subrays * subrays)
-    for j in range(ys.size):
-        for i in range(xs.size):
-            total = 0.0
-            for k in range(subrays):
-                for m in range(subrays):
-                    x = xs[i] + ((m + 0.5) / subrays - 0.5) * h
-                    y = ys[j] + ((k + 0.5) / subrays - 0.5) * h
-                    value, _ = _brightness(x, y, light, True, p, a)
-                    total += value
-            out[j, i] = total * area
-    return out
+    # The brightest pixel is the measure of all errors: first of all those that might be it, until one has proved to be.
+    while True:
+        certain, possible = image - error, image + error
+        limit = tolerance * max(float(certain.max()), 0.0)
+        rivals = np.flatnonzero((possible > 0.5 * possible.max()) & (error > limit))
+        if not rivals.size:
+            break
+        refine(rivals, limit, tolerance)
+    allowed = tolerance * float(np.maximum(certain, 0.0).sum())
+    while _sum_below(error, limit) > allowed:
+        limit *= 0.5
+    chosen = np.flatnonzero(error > limit)
+    if chosen.size:
+        refine(chosen, min(limit, allowed / chosen.size), 0.0)
+    return image * profile.flux
 
 
 def sample_lensed_sersic(
@@ -206,4 +206,8 @@ def sample_lensed_sersic(
 
     For fits that need many renderings; arguments and shapes as in :func:`render_sersic`.
     """
-    return np.asarray(_sample(x, y, pixel_scale, subrays, sersic_arguments(profile), *lens_arguments(lens)))
+    offsets = ((np.arange(subrays) + 0.5) / subrays - 0.5) * pixel_scale
+    columns, rows = np.add.outer(x, offsets).ravel(), np.add.outer(y, offsets).ravel()
+    u, v = _tracer(profile, lens)(np.tile(columns, rows.size), np.repeat(rows, columns.size))
+    rays = brightness(u, v, tabulate(profile)).reshape(len(y), subrays, len(x), subrays)
+    return np.asarray(rays.mean(axis=(1, 3)) * (profile.flux * pixel_scale**2))

@@ -4,12 +4,14 @@ import math
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from engine.catalogue import load_system, system_facts, system_names
 from engine.conventions import sky_to_image
 from engine.lensing.lens_equation import solve_lens_equation
-from engine.lensing.power_law import PowerLawLens, source_position
+from engine.lensing.power_law import PowerLawLens, magnification, source_position
 from engine.scene import power_law_lens
+from tests.engine.angular_solver import AngularSolver
 
 
 def lenstronomy_images(lens: PowerLawLens, x: float, y: float) -> list[tuple[float, float, float]]:
@@ -91,6 +93,72 @@ def test_the_catalogue_has_as_many_images_as_the_lens_equation_and_where_it_says
                 distance = min(math.hypot(image.x + east, image.y - north) for image in images)
                 # The catalogue's parameters are rounded to 1e-4 arcsec or 5e-5 in q.
                 assert distance < 1.5e-3
+
+
+def caustic_point(lens: PowerLawLens, rng: np.random.Generator) -> tuple[float, float, float, float]:
+    """A point of the tangential caustic, and a unit vector of any direction."""
+    # Half of the directions lie near the axes of the lens, where the caustic has its cusps.
+    angle = rng.uniform(0, 2 * math.pi)
+    if rng.uniform() < 0.5:
+        angle = lens.phi + 0.5 * math.pi * rng.integers(4) + rng.normal(0, 0.02)
+    low, high = 0.02 * lens.theta_E, 20.0 * lens.theta_E
+    cos, sin = math.cos(angle), math.sin(angle)
+    radii = np.geomspace(high, low, 600)
+    determinant = 1 / magnification(lens, lens.x + radii * cos, lens.y + radii * sin)
+    first = int(np.flatnonzero(determinant < 0)[0])
+    r = brentq(
+        lambda r: 1 / float(magnification(lens, np.array(lens.x + r * cos), np.array(lens.y + r * sin))),
+        radii[first],
+        radii[first - 1],
+        xtol=1e-15,
+    )
+    x, y = source_position(lens, np.array(lens.x + r * cos), np.array(lens.y + r * sin))
+    across = rng.uniform(0, 2 * math.pi)
+    return float(x), float(y), math.cos(across), math.sin(across)
+
+
+def any_lens(rng: np.random.Generator) -> PowerLawLens:
+    theta_E = rng.uniform(0.3, 2.5)
+    return PowerLawLens(
+        theta_E,
+        rng.uniform(0.3, 0.99),
+        rng.uniform(-1.6, 1.6),
+        rng.choice([2.0, rng.uniform(1.4, 2.6)]),
+        *rng.uniform(-0.1, 0.1, 2),
+        *(rng.uniform(-0.15, 0.15, 2) * rng.choice([0.0, 1.0])),
+    )
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_all_images_parities_and_magnifications_are_those_of_an_independent_solver(part: int) -> None:
+    # 10,000 configurations in all, every other one within 1e-7 to 1e-2 theta_E of the tangential caustic.
+    rng, found_by_both = np.random.default_rng([2017, part]), 0
+    for k in range(2500):
+        lens = any_lens(rng)
+        radius, angle = lens.theta_E * rng.uniform() ** 0.5, rng.uniform(0, 2 * math.pi)
+        x, y = lens.x + radius * math.cos(angle), lens.y + radius * math.sin(angle)
+        if k % 2:
+            x, y, dx, dy = caustic_point(lens, rng)
+            away = lens.theta_E * 10 ** rng.uniform(-7, -2)
+            x, y = x + away * dx, y + away * dy
+        solver = AngularSolver(lens)
+        theirs = [(px, py, solver.inverse_magnification(px, py)) for px, py in solver.images(x, y)]
+        ours = solve_lens_equation(lens, x, y, min_magnification=0.0)
+        where = f"{lens}, source {x!r} {y!r}"
+        for px, py, inverse in theirs:
+            if abs(inverse) > 100.0:
+                continue  # fainter than a hundredth: the central image, which the engine leaves out
+            found = min(ours, key=lambda image: math.hypot(image.x - px, image.y - py))
+            # The lens equation holds to rounding, 1e-15 arcsec, so an image is known to that times 1/inverse.
+            assert math.hypot(found.x - px, found.y - py) < 1e-9 + 1e-13 / abs(inverse), where
+            # Fourth-order differences over 1e-3 of the distance from the lens; the position's error adds to it.
+            assert 1 / found.magnification == pytest.approx(inverse, rel=1e-7, abs=1e-8 + 1e-12 / abs(inverse)), where
+        # What the engine finds beyond that is an image as well, and each is found once.
+        for i, image in enumerate(ours):
+            assert abs(solver.source(image.x, image.y) - complex(x, y)) < 1e-11, where
+            assert all(math.hypot(image.x - other.x, image.y - other.y) > 1e-5 * lens.theta_E for other in ours[:i])
+        found_by_both += sum(abs(inverse) <= 100.0 for *_, inverse in theirs)
+    assert found_by_both > 2 * 2500  # the comparison is not empty
 
 
 def test_two_images_are_born_on_crossing_the_astroid() -> None:

@@ -1,0 +1,36 @@
+"""Peers with requirements that ours would not bear: each in an environment of its own beside this file.
+
+``python -m benchmarks.peers`` makes the environments (a few minutes, half a gigabyte each); a benchmark asks
+:func:`interpreter` and says so where there is none.
+"""
+
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+PEERS = ("autolens",)
+_HERE = Path(__file__).parent
+
+
+def interpreter(peer: str) -> Path | None:
+    """Python of the environment of a peer, or None where it has not been made."""
+    environment = _HERE / f".venv-{peer}"
+    return environment / "bin" / "python" if (environment / "prepared").exists() else None
+
+
+def prepare(peer: str) -> Path:
+    """Make the environment of a peer from its pinned requirements, once."""
+    environment = _HERE / f".venv-{peer}"
+    python = environment / "bin" / "python"
+    if interpreter(peer) is None:
+        venv.create(environment, with_pip=True, clear=True)
+        requirements = str(_HERE / f"{peer}.txt")
+        subprocess.run([str(python), "-m", "pip", "install", "--quiet", "-r", requirements], check=True)
+        (environment / "prepared").touch()
+    return python
+
+
+def missing(peer: str) -> str:
+    """What to say where a peer has not been prepared."""
+    return f"{peer}: not prepared, run '{Path(sys.executable).name} -m benchmarks.peers'"
