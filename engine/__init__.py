@@ -36,6 +36,7 @@ from engine.spec import (
     SystemChoice,
     camera_from_mapping,
     realization_from_dict,
+    spec_digest,
     system_from_mapping,
 )
 from engine.validation import field_steps, spec_error
@@ -92,6 +93,7 @@ __all__ = [
     "realization_from_dict",
     "run",
     "simulate_realization",
+    "spec_digest",
     "spec_error",
     "system_facts",
     "system_from_mapping",

@@ -332,8 +332,7 @@ class Realization:
     @property
     def digest(self) -> str:
         """SHA-256 (hex) of the canonical JSON: the identity of the run."""
-        canonical = json.dumps(self.to_dict(), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(canonical.encode()).hexdigest()
+        return spec_digest(self.to_dict())
 
     @property
     def system_name(self) -> str:
@@ -344,6 +343,12 @@ class Realization:
 _REALIZATION = TypeAdapter(Realization)
 _SYSTEM = TypeAdapter(LensSystem)
 _CAMERA = TypeAdapter(Camera)
+
+
+def spec_digest(document: dict[str, Any]) -> str:
+    """SHA-256 (hex) of the canonical JSON of a realization's JSON-ready form: its digest, without reading it back."""
+    canonical = json.dumps(document, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def realization_from_dict(document: object) -> Realization:

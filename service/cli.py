@@ -192,6 +192,46 @@ def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
         typer.echo(grid_line(client.cancel(grid)))
 
 
+@app.command()
+def pause(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Start no further run of a grid for now; running ones go on to their end."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.pause(grid)))
+
+
+@app.command()
+def resume(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Go on with a paused grid."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.resume(grid)))
+
+
+@app.command()
+def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Queue again what failed, was quarantined or was cancelled."""
+    with _Talk(url) as client:
+        typer.echo(grid_line(client.retry(grid)))
+
+
+@app.command()
+def drill(
+    name: Annotated[str, typer.Argument(help="One of those that ``list`` shows")],
+    size: Annotated[list[str] | None, typer.Argument(help="Sizes to change, as runs=100")] = None,
+    small: Annotated[bool, typer.Option("--small", help="Sizes that take seconds")] = False,
+    database_url: Annotated[str | None, typer.Option("--database", help="An empty database instead of SQLite")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Where to write the report")] = None,
+) -> None:
+    """Put a promise of the service to the test, on a service of its own; exit code 1 if it does not hold."""
+    from service.drills.command import carry_out  # noqa: PLC0415 - loads the engine
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    sizes = size or []
+    if any("=" not in changed for changed in sizes):
+        _fail(f"sizes are given as name=value: {' '.join(sizes)}")
+    options = {"sizes": sizes, "small": small, "database_url": database_url, "json_file": json_file}
+    raise typer.Exit(carry_out(_console(), name, **options))  # type: ignore[arg-type]
+
+
 @database.command("upgrade")
 def db_upgrade() -> None:
     """Bring the database to the newest schema."""

@@ -87,11 +87,23 @@ class Client:
 
     def summary(self, grid_id: str) -> Summary:
         """Biases of a grid (the first thousand inputs)."""
-        return Summary.model_validate(self._call("GET", f"/v1/grids/{grid_id}/summary"))
+        return Summary.model_validate(self._call("GET", f"/v1/grids/{grid_id}/summary", params={"limit": 1000}))
 
     def cancel(self, grid_id: str) -> GridView:
         """Cancel a grid."""
         return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/cancel"))
+
+    def pause(self, grid_id: str) -> GridView:
+        """Start no further run of a grid for now."""
+        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/pause"))
+
+    def resume(self, grid_id: str) -> GridView:
+        """Go on with a paused grid."""
+        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/resume"))
+
+    def retry(self, grid_id: str) -> GridView:
+        """Queue again what failed, was quarantined or was cancelled."""
+        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/retry"))
 
     def readiness(self) -> Readiness:
         """Whether the service can compute."""

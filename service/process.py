@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
 
 PARENT_FD = "HOSTLENS_PARENT_FD"
 """Names the pipe whose other end only the supervisor holds."""
+
+
+def spare_collector() -> None:
+    """Take what is loaded by now out of Python's garbage collection, and have it run less often.
+
+    A summary of a thousand inputs makes twenty thousand objects, and every few hundred of them the collector would look
+    through all of the engine again: half of the time that the answer takes.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def stop_with_parent() -> None:

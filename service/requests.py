@@ -25,6 +25,7 @@ from engine import (
     load_camera,
     load_system,
     preset_names,
+    spec_digest,
     system_facts,
     system_names,
 )
@@ -160,7 +161,8 @@ def _planned(run: GridRun) -> PlannedRun:
         "magnitude": realization.host.magnitude,
         "seed": realization.seed,
     }
-    return PlannedRun(run.label, run.paper_run, realization.to_dict(), inputs, realization.digest)
+    spec = realization.to_dict()
+    return PlannedRun(run.label, run.paper_run, spec, inputs, spec_digest(spec))
 
 
 def list_systems() -> list[SystemItem]:

@@ -10,9 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.payload import ChainPayload, EstimateName, StagePayload
 from service.store.states import GridState, RunState
 
-UwsPhase = Literal["PENDING", "QUEUED", "EXECUTING", "COMPLETED", "ERROR", "ABORTED"]
+UwsPhase = Literal["PENDING", "QUEUED", "HELD", "EXECUTING", "COMPLETED", "ERROR", "ABORTED"]
 UWS_PHASES: dict[str, UwsPhase] = {
     "queued": "QUEUED",
+    "paused": "HELD",
     "leased": "EXECUTING",
     "running": "EXECUTING",
     "done": "COMPLETED",
@@ -51,6 +52,7 @@ class RunCounts(_Answer):
     """Runs of a grid by state."""
 
     queued: int = 0
+    paused: int = 0
     leased: int = 0
     done: int = 0
     failed: int = 0
@@ -80,6 +82,9 @@ class GridView(_Answer):
     created_at: datetime
     finished_at: datetime | None
     cancelled_at: datetime | None
+    paused_at: datetime | None
+    engine_digest: str | None
+    """Of the engine whose results the grid takes: the one that was installed where it was submitted."""
     request: dict[str, Any]
     links: dict[str, str]
 
@@ -119,6 +124,8 @@ class RunView(_Answer):
     uws_phase: UwsPhase
     inputs: dict[str, Any]
     attempt: int
+    suspect: bool
+    """It may have killed a worker, and is only run alone."""
     error: RunError | None
     finished_at: datetime | None
     links: dict[str, str]
@@ -329,4 +336,7 @@ class Readiness(_Answer):
     database: Literal["ok"] = "ok"
     dispatcher: Literal["ok", "missing"]
     workers: int
+    """Worker threads that runs are given to."""
+    engines: dict[str, int]
+    """Worker threads of each engine by its digest: a grid waits where its own is not among them."""
     beat_at: datetime | None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import signal
@@ -16,7 +17,7 @@ from pathlib import Path
 from threading import Event
 from typing import IO
 
-from service.process import PARENT_FD
+from service.process import PARENT_FD, stop_with_parent
 from service.settings import Settings
 from service.store.migrate import upgrade
 
@@ -156,7 +157,8 @@ def _end_group(process: subprocess.Popen[bytes]) -> None:
 def _as_environment(settings: Settings) -> dict[str, str]:
     """The settings as the variables that the children read, so that all agree whatever came from the command line."""
     values = settings.model_dump(mode="json", exclude_none=True)
-    return {f"HOSTLENS_{name.upper()}": str(value) for name, value in values.items()}
+    plain = {name: json.dumps(value) if isinstance(value, list) else str(value) for name, value in values.items()}
+    return {f"HOSTLENS_{name.upper()}": value for name, value in plain.items()}
 
 
 def require_free(settings: Settings) -> None:
@@ -175,6 +177,7 @@ def serve(settings: Settings, started: Callable[[], None] = lambda: None) -> Non
     stop = Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    stop_with_parent()
     require_free(settings)
     supervisor = Supervisor(settings)
     supervisor.prepare()

@@ -65,7 +65,7 @@ def runs_table(runs: Iterable[RunView]) -> Table:
 def grid_line(grid: GridView) -> str:
     """One line on how far a grid is."""
     parts = [f"{grid.id} {grid.state}: {grid.counts.done}/{grid.n_runs} stored"]
-    for state in ("leased", "failed", "quarantined", "cancelled"):
+    for state in ("leased", "paused", "failed", "quarantined", "cancelled"):
         number = getattr(grid.counts, state)
         if number:
             parts.append(f"{number} {'running' if state == 'leased' else state}")

@@ -9,7 +9,13 @@ from __future__ import annotations
 import dataclasses
 import io
 import logging
+import os
+import sys
+import time
 import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -20,16 +26,28 @@ if TYPE_CHECKING:
     from engine import RunResult
 
 _LOG = logging.getLogger(__name__)
+_FIRST_COLD = "parametric"
+"""Stage of the engine before which a warm-up ends: nearly all that is slow the first time is in the one before."""
+
+
+def call_tasks(task: str, specs: Sequence[dict[str, Any]], artefact_url: str) -> list[dict[str, Any]]:
+    """Run the task for one specification after the other; their answers in the same order.
+
+    The dispatcher submits this function, so that it need not import the engine itself. Short runs come several at a
+    time: what Dask does for each task would take longer than they do.
+    """
+    return [call_task(task, spec, artefact_url) for spec in specs]
 
 
 def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     """Run the task called ``module:function`` and answer ``{"payload": ...}`` or ``{"error": ...}``.
 
-    The dispatcher submits this function, so that it need not import the engine itself.
+    A payload comes with the digest of the engine that this process has loaded.
     """
     try:
         module, _, name = task.partition(":")
-        return {"payload": getattr(import_module(module), name)(spec, artefact_url)}
+        payload = getattr(import_module(module), name)(spec, artefact_url)
+        return {"payload": payload, "engine": _engine()}
     except Exception as error:  # noqa: BLE001 - whatever went wrong must go home as data; the dispatcher decides
         _LOG.warning("run failed on the worker:\n%s", traceback.format_exc())
         return {
@@ -39,6 +57,69 @@ def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, A
                 "permanent": _is_permanent(error),
             }
         }
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What a worker says before its first run: digest of its engine, its threads by library, seconds to get warm."""
+
+    engine: str
+    threads: dict[str, int]
+    warm_s: float
+
+
+def greet(task: str) -> Greeting:
+    """Make a worker ready: one thread for every numeric library, and the task's module loaded and warm.
+
+    A module says by a function ``warm_up`` how it gets warm. Workers that were started elsewhere have seldom been
+    told how many threads to use, so it is set here, as far as what is loaded already lets it.
+    """
+    began = time.perf_counter()
+    for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA"):
+        os.environ[f"{name}_NUM_THREADS"] = "1"
+    module = import_module(task.partition(":")[0])
+    engine = _engine()
+    getattr(module, "warm_up", lambda: None)()
+    return Greeting(engine, _one_thread(), time.perf_counter() - began)
+
+
+def _one_thread() -> dict[str, int]:
+    """Hold every loaded numeric library to one thread; how many each then uses."""
+    from threadpoolctl import threadpool_info, threadpool_limits
+
+    threadpool_limits(1)
+    threads = {str(pool["internal_api"]): int(pool["num_threads"]) for pool in threadpool_info()}
+    if "numba" in sys.modules:
+        # Read anew from the environment; where Numba's threads run already it refuses, and says how many there are.
+        from numba import config
+
+        config.reload_config()
+        threads["numba"] = int(config.NUMBA_NUM_THREADS)
+    return threads
+
+
+def _engine() -> str:
+    from engine import engine_digest
+
+    return engine_digest()
+
+
+class _WarmError(Exception):
+    """Ends a run that has loaded what it was started for."""
+
+
+def warm_up() -> None:
+    """Load or compile the engine's kernels, with a small run that is ended before its long stages."""
+    from engine import Analysis, Host, Realization, run
+
+    def seen(stage: str, _done: float) -> None:
+        if stage == _FIRST_COLD:
+            raise _WarmError
+
+    small = Analysis(source_pixels=(12, 12), subrays=1, walkers=4, max_steps=10, draws=2)
+    realization = Realization("HE0435", 1.0, Host(n=2.0, r_eff=0.39, magnitude=21.0), analysis=small)
+    with suppress(_WarmError):
+        run(realization, seen)
 
 
 def execute(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:

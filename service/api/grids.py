@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
 
+from engine import engine_digest
 from service.api.context import GridId, Limit, RunId, Service
 from service.api.pages import next_link
 from service.identifiers import GRID_PATTERN
@@ -40,7 +41,11 @@ def submit(
         labels = [run.label for run in plan(body, service.settings.max_grid_runs)]
         return JSONResponse(DryRun(n_runs=len(labels), labels=labels[:_SHOWN_LABELS]).model_dump(mode="json"))
     made = service.grids.create(
-        body.canonical(), lambda: plan(body, service.settings.max_grid_runs), body.name, idempotency_key
+        body.canonical(),
+        lambda: plan(body, service.settings.max_grid_runs),
+        body.name,
+        idempotency_key,
+        engine_digest(),
     )
     headers = {"Location": made.grid.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
     return JSONResponse(made.grid.model_dump(mode="json"), status_code=202, headers=headers)
@@ -86,7 +91,7 @@ def summary(
     response: Response,
     grid_id: GridId,
     service: Service,
-    limit: Limit = 1000,
+    limit: Limit = 100,
     cursor: Ordinal = 0,
 ) -> Summary:
     """Recovered values and biases by input, and over the whole grid."""
@@ -98,6 +103,25 @@ def summary(
 def cancel(grid_id: GridId, service: Service) -> GridView:
     """Cancel a grid: queued runs at once, running ones as soon as the dispatcher sees it."""
     return service.grids.cancel(grid_id)
+
+
+@router.post("/grids/{grid_id}/pause")
+def pause(grid_id: GridId, service: Service) -> GridView:
+    """Pause a grid: no queued run is started any more; running ones end as they would."""
+    return service.grids.pause(grid_id)
+
+
+@router.post("/grids/{grid_id}/resume")
+def resume(grid_id: GridId, service: Service) -> GridView:
+    """Resume a paused grid."""
+    return service.grids.resume(grid_id)
+
+
+@router.post("/grids/{grid_id}/retry")
+def retry(grid_id: GridId, service: Service) -> GridView:
+    """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts."""
+    service.grids.revive(grid_id)
+    return service.grids.grid(grid_id)
 
 
 @router.get("/runs/{run_id}")

@@ -25,5 +25,6 @@ def readyz(service: Service) -> Readiness:
         status="ready" if workers else "degraded",
         dispatcher="missing" if leader is None else "ok",
         workers=workers,
+        engines={} if leader is None else leader.engines,
         beat_at=None if leader is None else leader.beat_at,
     )

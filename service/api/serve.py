@@ -5,7 +5,7 @@ from __future__ import annotations
 import uvicorn
 
 from service.api.app import create_app
-from service.process import stop_with_parent
+from service.process import spare_collector, stop_with_parent
 from service.settings import Settings
 
 
@@ -13,4 +13,5 @@ def serve(settings: Settings) -> None:
     """Serve until SIGINT or SIGTERM, or until the supervisor that started this process is gone."""
     stop_with_parent()
     app = create_app(settings)
+    spare_collector()
     uvicorn.run(app, host=settings.host, port=settings.port, log_level="warning", timeout_graceful_shutdown=5)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import traceback
+from dataclasses import dataclass
 from typing import Any
-
-from distributed import KilledWorker
 
 from service.payload import InvalidResultError, ResultPayload, read_payload
 from service.store.leases import Lease, Outcome
@@ -16,7 +15,21 @@ WORKER_LOST_RETRIES = 2
 DEADLINE_RETRIES = 1
 
 
-def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure:
+@dataclass(frozen=True)
+class OtherEngine:
+    """A result that is not taken: the worker's engine, of this digest, is not the grid's."""
+
+    digest: str
+
+
+def read_part(lease: Lease, answers: Any, place: int) -> ResultPayload | Failure | OtherEngine:
+    """What a worker's answers to several runs mean for one of them."""
+    if not isinstance(answers, list) or place >= len(answers):
+        return _invalid("the worker did not answer for every run that it was given")
+    return read_answer(lease, answers[place])
+
+
+def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEngine:
     """What a worker's answer means for the run."""
     if not isinstance(answer, dict) or not {"payload", "error"} & set(answer):
         return _invalid("the worker's answer has neither a payload nor an error")
@@ -24,6 +37,8 @@ def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure:
         error = answer["error"]
         retries = 0 if error["permanent"] else ERROR_RETRIES
         return Failure(Outcome.ERROR, str(error["code"])[:64], clean(error["message"]), retries)
+    if lease.engine is not None and answer.get("engine") != lease.engine:
+        return OtherEngine(clean(answer.get("engine"))[:64])
     try:
         payload = read_payload(answer["payload"])
     except InvalidResultError as error:
@@ -35,12 +50,15 @@ def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure:
 
 def read_exception(error: BaseException) -> Failure:
     """What Dask's own failure to run a run means for it."""
-    if isinstance(error, KilledWorker):
-        text = "the worker died while it ran this"
-        return Failure(Outcome.WORKER_LOST, "worker_lost", text, WORKER_LOST_RETRIES, suspect=True)
     # Not str(error): that calls code of whatever library raised it, which may raise itself.
     text = clean("".join(traceback.format_exception_only(error)).strip())
     return Failure(Outcome.ERROR, "task_error", text, ERROR_RETRIES)
+
+
+def worker_lost() -> Failure:
+    """A run that was alone on a worker when that died."""
+    text = "the worker died while it ran this"
+    return Failure(Outcome.WORKER_LOST, "worker_lost", text, WORKER_LOST_RETRIES, suspect=True)
 
 
 def overdue(deadline_s: float) -> Failure:

@@ -16,11 +16,14 @@ _LOG = logging.getLogger(__name__)
 
 
 class Heartbeat:
-    """Beats for one generation until it is stopped; ``lost`` is set once another leads."""
+    """Beats for one generation until it is stopped; ``lost`` is set once another leads.
+
+    ``engines`` is what it tells: worker threads of each engine by its digest. It is replaced, never changed.
+    """
 
     def __init__(self, settings: Settings, generation: int) -> None:
         self.lost = threading.Event()
-        self.workers = 0
+        self.engines: dict[str, int] = {}
         self._settings = settings
         self._generation = generation
         self._stop = threading.Event()
@@ -38,10 +41,10 @@ class Heartbeat:
     def _beat(self) -> None:
         database = Database(self._settings.database, pooled=False)
         leadership = Leadership(database, self._settings.leader_ttl_s)
-        told = -1
+        told: dict[str, int] | None = None
         while not self._stop.is_set():
             try:
-                told = self.workers
+                told = self.engines
                 if not leadership.beat(self._generation, told):
                     _LOG.error("another dispatcher leads")
                     self.lost.set()
@@ -53,8 +56,8 @@ class Heartbeat:
             self._wait(told)
         database.close()
 
-    def _wait(self, told: int) -> None:
-        """Sleep for a beat, or less where the number of workers changes: readiness should not lag behind it."""
+    def _wait(self, told: dict[str, int] | None) -> None:
+        """Sleep for a beat, or less where the workers change: readiness should not lag behind it."""
         until = time.monotonic() + self._settings.heartbeat_s
-        while time.monotonic() < until and self.workers == told and not self._stop.wait(0.2):
+        while time.monotonic() < until and self.engines == told and not self._stop.wait(0.2):
             pass

@@ -1,23 +1,27 @@
-"""The dispatcher's loop: claim, submit, collect, store, reconcile."""
+"""The dispatcher's loop: claim, place, collect, store, reconcile."""
 
 from __future__ import annotations
 
 import logging
+import math
 import queue as queues
 import time
-from collections import deque
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from functools import partial
 from threading import Event
 from typing import Any
 
+from distributed import KilledWorker
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
-from service.dispatcher.endings import overdue, read_answer, read_exception, unstorable
+from service.dispatcher.attribution import Deaths
+from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, unstorable, worker_lost
 from service.dispatcher.heartbeat import Heartbeat
-from service.dispatcher.pool import Pool, is_lost
+from service.dispatcher.placement import Slots
+from service.dispatcher.pool import Pool, Worker, is_lost
 from service.payload import ResultPayload
 from service.settings import Settings
 from service.store.leases import Lease, Outcome
@@ -25,164 +29,328 @@ from service.store.queue import Failure, RunQueue, Stored
 
 _LOG = logging.getLogger(__name__)
 _GATHER_S = 30.0
-_CANCEL_LOOK_S = 1.0
+_LOOK_S = 1.0
 _MAX_BACK_OFF_S = 10.0
 _EMPTY_LOOKS = 3
+_GONE_S = 1.0
+_NO_WINDOW = 1_000_000
 
 
 @dataclass
-class _Flight:
+class Flight:
+    """A run on a worker: at ``place`` of the answers of a Dask task, where ``beside`` others are too."""
+
     lease: Lease
+    worker: str
     future: Any
+    place: int
+    beside: int
     started: float
+    missed: float | None = None
+    """Since when its worker has been gone."""
 
 
 class Dispatcher:
-    """One leader's work, from its first claim until it stops.
+    """One leader's work, from its first claim until it stops, on one pool of workers after another.
 
     Endings (results and failures) wait in a line until the database has them: while one cannot be written nothing
     is claimed, and no result is dropped because the database was away.
     """
 
-    def __init__(self, settings: Settings, queue: RunQueue, pool: Pool, heartbeat: Heartbeat, generation: int) -> None:
+    def __init__(self, settings: Settings, queue: RunQueue, heartbeat: Heartbeat, generation: int) -> None:
         self._settings = settings
         self._queue = queue
-        self._pool = pool
         self._heartbeat = heartbeat
         self._generation = generation
-        self._flights: dict[str, _Flight] = {}
+        self._pool: Pool
+        self._flights: dict[str, Flight] = {}
         self._done: queues.SimpleQueue[str] = queues.SimpleQueue()
         self._endings: deque[Callable[[], object]] = deque()
+        self._deaths: Deaths[Flight] = Deaths()
+        self._slots = Slots(settings.worker_lifetime_s)
+        self._suspects: set[str] = set()
+        """Engines for which a suspect waits."""
         self._back_off = 0.0
         self._empty_looks = 0
-        self._due = {"cancel": 0.0, "reconcile": 0.0}
+        self._due: dict[str, float] = {}
 
-    def run(self, stop: Event) -> None:
-        """Dispatch until ``stop`` is set, the leadership is lost or the scheduler is gone."""
+    def run(self, pool: Pool, stop: Event) -> None:
+        """Dispatch until ``stop`` is set, the leadership is lost or the scheduler is gone.
+
+        Raises
+        ------
+        service.store.leadership.LeadershipLostError
+            Another dispatcher leads.
+        """
+        self._pool = pool
+        self._empty_looks = 0
         while not (stop.is_set() or self._heartbeat.lost.is_set()):
-            if not self._pool.running:
+            if not pool.running:
                 _LOG.error("the scheduler is gone")
                 return
-            try:
-                self._step()
-                self._back_off = 0.0
-            except (OperationalError, InterfaceError) as error:
-                self._back_off = min(max(2 * self._back_off, 0.2), _MAX_BACK_OFF_S)
-                _LOG.warning("the database is away, next try in %.1f s: %s", self._back_off, error.orig)
-                stop.wait(self._back_off)
+            self._guarded(self._step, stop.wait)
 
-    def hand_back(self) -> None:
-        """Write what has ended, give the rest back to the queue, uncharged."""
+    def drain(self) -> None:
+        """Claim nothing more, and wait a little for what is about to end; a run that takes longer is handed back."""
+        until = time.monotonic() + self._settings.drain_s
+        while self._flights and self._pool.running and time.monotonic() < until and not self._heartbeat.lost.is_set():
+            self._guarded(self._land_and_write, time.sleep)
+
+    def hand_back(self, outcome: Outcome = Outcome.HANDED_BACK) -> None:
+        """Write what has ended, give the rest back to the queue, uncharged; without the database both wait."""
         self._collect(0.001)
-        self._write_endings()
-        leases = [flight.lease for flight in self._flights.values()]
+        gone = [*self._flights.values(), *self._deaths.take_back()]
         self._flights.clear()
-        if leases:
-            _LOG.info("handing back %d runs", self._queue.hand_back(leases))
+        self._slots.clear()
+        if gone:
+            _LOG.info("handing back %d runs: %s", len(gone), outcome)
+            leases = [flight.lease for flight in gone]
+            self._endings.append(partial(self._queue.hand_back, leases, outcome))
+        self._write_endings()
+
+    def _guarded(self, step: Callable[[], None], wait: Callable[[float], object]) -> None:
+        """One step; where the database is away, a wait that grows."""
+        try:
+            step()
+            self._back_off = 0.0
+        except (OperationalError, InterfaceError) as error:
+            self._back_off = min(max(2 * self._back_off, 0.2), _MAX_BACK_OFF_S)
+            _LOG.warning("the database is away, next try in %.1f s: %s", self._back_off, error.orig)
+            wait(self._back_off)
 
     def _step(self) -> None:
         self._write_endings()
-        self._fill()
+        workers = self._pool.workers()
+        self._tell(workers)
+        self._fill(workers)
         # With every worker busy there is nothing to look for in the queue until one of them is done.
-        busy = len(self._flights) >= self._pool.threads() > 0
-        self._collect(_CANCEL_LOOK_S if busy else self._settings.poll_s)
+        busy = bool(workers) and not self._slots.free(workers)
+        self._collect(_LOOK_S if busy else self._settings.poll_s)
+        self._look_for_deaths()
         self._write_endings()
-        if self._is_due("cancel", _CANCEL_LOOK_S) and self._flights:
+        if self._is_due("cancel", _LOOK_S) and self._flights:
             self._stop_cancelled()
         if self._is_due("reconcile", self._settings.reconcile_s):
             self._reconcile()
 
-    def _fill(self) -> None:
-        """Claim and submit as many runs as there is room for."""
-        threads = self._pool.threads()
-        self._heartbeat.workers = threads
-        room = min(self._settings.window or threads, threads) - len(self._flights)
-        if room <= 0 or not self._queue.waiting():
-            return
-        for lease in self._queue.claim(self._generation, room):
-            key = lease.key
-            future = self._pool.submit(lease, lambda _, key=key: self._done.put(key))  # type: ignore[misc]
-            self._flights[key] = _Flight(lease, future, time.monotonic())
+    def _land_and_write(self) -> None:
+        self._collect(0.1)
+        self._look_for_deaths()
+        self._write_endings()
+
+    def _tell(self, workers: list[Worker]) -> None:
+        engines: Counter[str] = Counter()
+        for worker in workers:
+            engines[worker.engine] += worker.threads
+        if engines != self._heartbeat.engines:
+            self._heartbeat.engines = dict(engines)
+
+    def _fill(self, workers: list[Worker]) -> None:
+        """Claim and place as many runs as there is room for, a suspect first."""
+        old = self._slots.outlived(workers, time.monotonic())
+        self._pool.stop(old)
+        for engine in {worker.engine for worker in workers}:
+            mine = [worker for worker in workers if worker.engine == engine and worker.address not in old]
+            self._fill_lane(engine, mine)
+            free = self._slots.free(mine)[: self._room()]
+            if free and self._queue.waiting(engine):
+                wanted = min(len(free) * self._settings.batch, self._room())
+                self._place(self._queue.claim(self._generation, wanted, engine), free)
+
+    def _fill_lane(self, engine: str, workers: list[Worker]) -> None:
+        """Give the next suspect a worker of its own."""
+        if self._is_due(f"suspects {engine}", _LOOK_S):
+            if self._queue.waiting(engine, suspects=True):
+                self._suspects.add(engine)
+            else:
+                self._suspects.discard(engine)
+                self._slots.no_suspects()
+        lane = self._slots.lane(workers) if engine in self._suspects and self._room() else None
+        if lane is not None:
+            self._suspects.discard(engine)
+            self._place(self._queue.claim(self._generation, 1, engine, suspects=True), [lane])
+
+    def _room(self) -> int:
+        """How many more runs may be in flight, whatever the workers have room for."""
+        window = self._settings.window
+        return max((window or _NO_WINDOW) - len(self._flights), 0)
+
+    def _place(self, leases: list[Lease], workers: list[Worker]) -> None:
+        """Give each worker its part of the runs, as one task."""
+        size = math.ceil(len(leases) / len(workers))
+        for start, worker in zip(range(0, len(leases), max(size, 1)), workers, strict=False):
+            batch = leases[start : start + size]
+            self._slots.take(worker.address, batch[0].key, alone=batch[0].suspect)
+            future = self._pool.submit(batch, worker)
+            now = time.monotonic()
+            for place, lease in enumerate(batch):
+                self._flights[lease.key] = Flight(lease, worker.address, future, place, len(batch) - 1, now)
+            future.add_done_callback(lambda done: self._done.put(done.key))
+
+    def _remove(self, key: str) -> Flight:
+        flight = self._flights.pop(key)
+        self._slots.release(flight.worker, flight.future.key)
+        return flight
 
     def _collect(self, wait_s: float) -> None:
-        """Turn runs that Dask has ended into endings, waiting for the first of them."""
+        """Turn runs that Dask has ended into endings, waiting for the first of them; results make one ending."""
+        results: list[tuple[Lease, ResultPayload]] = []
         try:
-            self._land(self._done.get(timeout=wait_s))
+            self._land(self._done.get(timeout=wait_s), results)
             while True:
-                self._land(self._done.get_nowait())
+                self._land(self._done.get_nowait(), results)
         except queues.Empty:
-            return
+            if results:
+                self._endings.append(partial(self._store, results))
 
-    def _land(self, key: str) -> None:
-        flight = self._flights.get(key)
-        if flight is None or is_lost(flight.future):
+    def _land(self, task: str, results: list[tuple[Lease, ResultPayload]]) -> None:
+        """End the runs of a Dask task; what there is to store comes to ``results``."""
+        flights = [flight for flight in self._flights.values() if flight.future.key == task]
+        if not flights or is_lost(flights[0].future):
             return  # stopped by us, or for the reconciliation to look at
-        lease = flight.lease
-        ending: ResultPayload | Failure
-        if flight.future.status == "error":
-            ending = read_exception(flight.future.exception(timeout=_GATHER_S))
+        future, answers = flights[0].future, None
+        error: BaseException | None = None
+        if future.status == "error":
+            error = future.exception(timeout=_GATHER_S)
+            if isinstance(error, KilledWorker):
+                self._bury(flights[0].worker)
+                return
         else:
             try:
-                ending = read_answer(lease, flight.future.result(timeout=_GATHER_S))
+                answers = future.result(timeout=_GATHER_S)
             except (OSError, TimeoutError, CancelledError):
-                return  # the worker went before its answer was fetched: the reconciliation finds out what is left
-            except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
-                ending = read_exception(error)
-        del self._flights[key]
+                return  # the worker went before its answer was fetched: a later look finds out what is left
+            except Exception as broken:  # noqa: BLE001 - the answer came from another process and may be anything
+                error = broken
+        for flight in flights:
+            self._remove(flight.lease.key)
+        if error is not None and len(flights) > 1:
+            self._suspect(flights, f"one of {len(flights)} runs may be the cause: {read_exception(error).detail}")
+            return
+        for flight in flights:
+            self._end(flight, answers if error is None else error, results)
+
+    def _end(self, flight: Flight, answers: Any, results: list[tuple[Lease, ResultPayload]]) -> None:
+        lease = flight.lease
+        ending: ResultPayload | Failure | OtherEngine
+        try:
+            broken = isinstance(answers, BaseException)
+            ending = read_exception(answers) if broken else read_part(lease, answers, flight.place)
+        except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
+            ending = read_exception(error)
         if isinstance(ending, Failure):
             _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, ending.detail)
             self._endings.append(partial(self._queue.fail, lease, ending))
+        elif isinstance(ending, OtherEngine):
+            _LOG.warning("run %s, attempt %d: engine %s", lease.run_id, lease.attempt, ending.digest)
+            self._endings.append(partial(self._queue.refuse_engine, lease, ending.digest))
         else:
-            self._endings.append(partial(self._store, lease, ending))
+            results.append((lease, ending))
 
-    def _store(self, lease: Lease, payload: ResultPayload) -> None:
+    def _store(self, results: list[tuple[Lease, ResultPayload]]) -> None:
         try:
-            stored = self._queue.store(lease, payload)
+            stored = self._queue.store_all(results)
         except (OperationalError, InterfaceError):
             raise
         except DBAPIError as error:
-            _LOG.exception("run %s cannot be stored", lease.run_id)
-            self._queue.fail(lease, unstorable(error))
+            if len(results) > 1:
+                # Nothing was stored; each is tried alone, so that one that is refused keeps no other out.
+                self._endings.extend(partial(self._store, [one]) for one in results)
+                return
+            _LOG.exception("run %s cannot be stored", results[0][0].run_id)
+            self._queue.fail(results[0][0], unstorable(error))
             return
-        if stored is not Stored.STORED:
-            _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, stored)
+        for (lease, _), outcome in zip(results, stored, strict=True):
+            if outcome is not Stored.STORED:
+                _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, outcome)
 
     def _write_endings(self) -> None:
         while self._endings:
             self._endings[0]()
             self._endings.popleft()
 
+    def _bury(self, address: str) -> None:
+        """A worker died with what it was at."""
+        self._pool.forget(address)
+        flights = [self._remove(key) for key, flight in list(self._flights.items()) if flight.worker == address]
+        if self._pool.was_stopped(address) or self._pool.closed_on_purpose(address):
+            self._lose(flights, "the worker was stopped")
+            return
+        _LOG.warning("worker %s died with %d runs", address, len(flights))
+        self._deaths.add(flights, time.monotonic())
+
+    def _look_for_deaths(self) -> None:
+        """Judge the dead, and give back what is on workers that are gone without Dask having blamed anyone."""
+        present = self._pool.present()
+        if present is not None and self._pool.running:
+            now = time.monotonic()
+            for key, flight in list(self._flights.items()):
+                if flight.worker in present:
+                    flight.missed = None
+                elif flight.missed is None:
+                    flight.missed = now
+                elif now - flight.missed > _GONE_S and not flight.future.done():
+                    # Long enough for Dask to have said that the worker died with this run, if it had.
+                    self._lose([self._remove(key)], "the worker is gone")
+                    flight.future.cancel()
+        verdict = self._deaths.judge(time.monotonic())
+        if verdict is None:
+            return
+        if verdict.guilty is not None:
+            self._endings.append(partial(self._queue.fail, verdict.guilty.lease, worker_lost()))
+        if verdict.suspects:
+            self._suspect(verdict.suspects, f"one of {len(verdict.suspects)} runs may have killed a worker")
+
+    def _suspect(self, flights: Sequence[Flight], detail: str) -> None:
+        """Runs one of which is to blame go back uncharged, to be tried one at a time."""
+        self._endings.append(partial(self._queue.suspect, [flight.lease for flight in flights], detail))
+
+    def _lose(self, flights: Iterable[Flight], detail: str) -> None:
+        """Runs that are not to blame go back uncharged."""
+        for flight in flights:
+            _LOG.info("run %s, attempt %d goes back: %s", flight.lease.run_id, flight.lease.attempt, detail)
+            self._endings.append(partial(self._queue.requeue_lost, flight.lease, Outcome.FORGOTTEN, detail))
+
     def _stop_cancelled(self) -> None:
         cancelled = set(self._queue.to_cancel(self._generation))
-        for key, flight in list(self._flights.items()):
-            if flight.lease.run_id in cancelled:
-                # First the database, then the worker: whatever comes back now finds its lease gone.
-                self._queue.cancel_leased(flight.lease)
-                del self._flights[key]
-                self._pool.stop(flight.future)
+        stopped = [key for key, flight in self._flights.items() if flight.lease.run_id in cancelled]
+        for key in stopped:
+            # First the database, then the worker: whatever comes back now finds its lease gone.
+            self._queue.cancel_leased(self._flights[key].lease)
+        self._stop_workers_of([self._remove(key) for key in stopped])
+
+    def _stop_workers_of(self, flights: list[Flight]) -> None:
+        """End what no longer has a lease; runs beside it on the same worker go back when the worker is gone."""
+        if flights:
+            self._pool.stop({flight.worker for flight in flights}, [flight.future for flight in flights])
 
     def _reconcile(self) -> None:
         """Compare what is in flight with what Dask and the database think."""
         now = time.monotonic()
         # Several looks in a row: workers that are away for a moment come back to what they were doing.
-        self._empty_looks = 0 if self._pool.threads() else self._empty_looks + 1
+        self._empty_looks = 0 if self._pool.present() else self._empty_looks + 1
         stranded = self._empty_looks >= _EMPTY_LOOKS
+        overdue_flights = []
         for key, flight in list(self._flights.items()):
-            lease = flight.lease
             if stranded or is_lost(flight.future):
-                self._queue.requeue_lost(lease, Outcome.FORGOTTEN, "no workers" if stranded else "unknown to Dask")
-                del self._flights[key]
+                self._lose([self._remove(key)], "no workers" if stranded else "unknown to Dask")
                 flight.future.cancel()
             elif now - flight.started > self._settings.deadline_s:
-                self._queue.fail(lease, overdue(self._settings.deadline_s))
-                del self._flights[key]
-                self._pool.stop(flight.future)
+                ending = overdue(self._settings.deadline_s)
+                overdue_flights.append(self._remove(key))
+                if flight.beside:
+                    self._suspect([flight], f"one of {flight.beside + 1} runs was {ending.detail}")
+                else:
+                    self._endings.append(partial(self._queue.fail, flight.lease, ending))
             elif flight.future.done():
-                self._done.put(key)  # in case the callback was lost
-        self._queue.requeue_forgotten(self._generation, [f.lease.run_id for f in self._flights.values()])
+                self._done.put(flight.future.key)  # in case the callback was lost
+        self._stop_workers_of(overdue_flights)
+        self._write_endings()
+        known = [*self._flights.values(), *self._deaths.waiting]
+        self._queue.requeue_forgotten(self._generation, [flight.lease.run_id for flight in known])
 
     def _is_due(self, what: str, every_s: float) -> bool:
-        if time.monotonic() < self._due[what]:
+        if time.monotonic() < self._due.get(what, 0.0):
             return False
         self._due[what] = time.monotonic() + every_s
         return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import time
 from contextlib import suppress
 from threading import Event
 from types import FrameType
@@ -13,16 +14,18 @@ from sqlalchemy.exc import DBAPIError
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.holder import is_dead, own_name
 from service.dispatcher.loop import Dispatcher
-from service.dispatcher.pool import open_pool
+from service.dispatcher.pool import Pool, open_pool
 from service.process import stop_with_parent
 from service.settings import Settings
 from service.store.database import Database
 from service.store.leadership import Leadership, LeadershipLostError
+from service.store.leases import Outcome
 from service.store.queue import RunQueue
 
 _LOG = logging.getLogger(__name__)
 STOPPED, ENDED = 0, 75
-"""Exit codes: stopped as asked; ended because the leadership, the scheduler or the database was lost."""
+"""Exit codes: stopped as asked; ended because the leadership or the database was lost."""
+_FIRST_DELAY_S, _MAX_DELAY_S, _STEADY_S = 0.5, 30.0, 30.0
 
 
 def dispatch(settings: Settings) -> int:
@@ -45,10 +48,7 @@ def dispatch(settings: Settings) -> int:
         generation = wait_to_lead(leadership, settings, stop)
         if generation is None:
             return STOPPED
-        try:
-            _lead(settings, database, generation, stop)
-        except OSError as error:
-            _LOG.error("no workers: %s", error)
+        _lead(settings, database, generation, stop)
         with suppress(DBAPIError):  # without it the row runs out by itself
             leadership.resign(generation)
     finally:
@@ -73,19 +73,37 @@ def wait_to_lead(leadership: Leadership, settings: Settings, stop: Event) -> int
 
 
 def _lead(settings: Settings, database: Database, generation: int, stop: Event) -> None:
+    """Dispatch on one pool of workers after another, until stopped or deposed."""
     heartbeat = Heartbeat(settings, generation)
     heartbeat.start()
+    queue = RunQueue(database, retry_delay_s=settings.retry_delay_s)
+    dispatcher = Dispatcher(settings, queue, heartbeat, generation)
+    delay = _FIRST_DELAY_S
     try:
-        queue = RunQueue(database, retry_delay_s=settings.retry_delay_s)
-        with open_pool(settings) as pool:
-            dispatcher = Dispatcher(settings, queue, pool, heartbeat, generation)
+        while not (stop.is_set() or heartbeat.lost.is_set()):
+            began = time.monotonic()
             try:
-                dispatcher.run(stop)
-            except LeadershipLostError as error:
-                _LOG.error("%s", error)
-            finally:
-                # Without the database they are voided by the next leader instead.
-                with suppress(DBAPIError):
-                    dispatcher.hand_back()
+                with open_pool(settings) as pool:
+                    _dispatch_on(pool, dispatcher, stop)
+            except OSError as error:
+                _LOG.error("no workers, next try in %.1f s: %s", delay, error)
+            heartbeat.engines = {}
+            if time.monotonic() - began > _STEADY_S:
+                delay = _FIRST_DELAY_S
+            stop.wait(delay)
+            delay = min(2 * delay, _MAX_DELAY_S)
+    except LeadershipLostError as error:
+        _LOG.error("%s", error)
     finally:
         heartbeat.stop()
+
+
+def _dispatch_on(pool: Pool, dispatcher: Dispatcher, stop: Event) -> None:
+    try:
+        dispatcher.run(pool, stop)
+        if stop.is_set():
+            dispatcher.drain()
+    finally:
+        # Without the database it is tried again on the next workers; the next leader voids what is left.
+        with suppress(DBAPIError):
+            dispatcher.hand_back(Outcome.HANDED_BACK if stop.is_set() else Outcome.SCHEDULER_LOST)

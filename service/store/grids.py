@@ -1,4 +1,4 @@
-"""Grids and runs as the API sees them: created, looked at, cancelled."""
+"""Grids and runs as the API sees them: created, looked at, paused, resumed, cancelled, tried again."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from sqlalchemy.exc import IntegrityError
 from service.identifiers import new_grid_id, run_id, utc_now
 from service.schemas import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
-from service.store.leases import add_event, close_grids, lock_grids
-from service.store.states import CANCEL, REVIVE, GridState, RunState, move
+from service.store.leases import add_event, close_grids, lock_grids, pause_queued
+from service.store.pace import recent
+from service.store.states import CANCEL, RESUME, REVIVE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, idempotency, result, run
-from service.store.views import RUN_COLUMNS, Recent, grid_view, run_detail, run_view
+from service.store.views import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
 
 _T = TypeVar("_T")
 _BATCH = 5000
-_RATE_RUNS = 100
 
 
 class NotFoundError(LookupError):
@@ -66,11 +66,13 @@ class GridStore:
         plan: Callable[[], Sequence[PlannedRun]],
         name: str | None = None,
         key: str | None = None,
+        engine: str | None = None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
         Grid, runs and key are one transaction: after a crash there is the whole grid or none of it. ``plan`` is
-        called only where there is something to create.
+        called only where there is something to create. ``engine`` is the digest of the engine whose results the grid
+        takes, any where None.
 
         Raises
         ------
@@ -83,7 +85,7 @@ class GridStore:
             return Created(known, replayed=True)
         runs = plan()
         try:
-            return Created(self._insert(request, runs, name, key, canonical), replayed=False)
+            return Created(self._insert(request, runs, name, key, canonical, engine), replayed=False)
         except IntegrityError:
             # Someone came first with the same key, between our look and our insert.
             known = self._by_key(key, canonical)
@@ -98,12 +100,13 @@ class GridStore:
         name: str | None,
         key: str | None,
         canonical: str,
+        engine: str | None,
     ) -> GridView:
         now = self._clock()
         grid_id = new_grid_id(now)
         with self._database.write() as connection:
             row = {"id": grid_id, "name": name, "request": request, "n_runs": len(runs), "created_at": now}
-            connection.execute(insert(grid).values(state=GridState.QUEUED, **row))
+            connection.execute(insert(grid).values(state=GridState.QUEUED, engine_digest=engine, **row))
             if key is not None:
                 made = {"key": key, "request_digest": canonical, "grid_id": grid_id, "created_at": now}
                 connection.execute(insert(idempotency), made)
@@ -171,29 +174,59 @@ class GridStore:
             self._require(connection, grid_id)
             lock_grids(connection, [grid_id])
             open_grid = (grid.c.id == grid_id) & (grid.c.state == GridState.QUEUED) & grid.c.cancelled_at.is_(None)
-            marked = connection.execute(update(grid).where(open_grid).values(cancelled_at=now))
+            marked = connection.execute(update(grid).where(open_grid).values(cancelled_at=now, paused_at=None))
             if marked.rowcount:
                 dropped = move(connection, CANCEL, run.c.grid_id == grid_id, finished_at=now)
                 add_event(connection, grid_id, "grid_cancelled", now, queued=len(dropped))
                 close_grids(connection, [grid_id], now)
             return self._grid(connection, grid_id)
 
-    def revive(self, grid_id: str) -> int:
-        """Queue again every run of a grid that ended without a result; how many.
+    def pause(self, grid_id: str) -> GridView:
+        """Take the queued runs of a grid out of the queue; what is running goes on to its end.
 
-        Earlier attempts stay on record but are no longer counted against the run.
+        A grid that has ended, is being cancelled or is paused already stays as it is.
         """
         now = self._clock()
         with self._database.write() as connection:
             self._require(connection, grid_id)
             lock_grids(connection, [grid_id])
-            fresh = {"not_before": now, "charged_from": run.c.attempt, "finished_at": None}
+            open_grid = (grid.c.id == grid_id) & (grid.c.state == GridState.QUEUED) & grid.c.cancelled_at.is_(None)
+            marked = connection.execute(update(grid).where(open_grid, grid.c.paused_at.is_(None)).values(paused_at=now))
+            if marked.rowcount:
+                held = pause_queued(connection, run.c.grid_id == grid_id)
+                add_event(connection, grid_id, "grid_paused", now, runs=len(held))
+            return self._grid(connection, grid_id)
+
+    def resume(self, grid_id: str) -> GridView:
+        """Put the paused runs of a grid back to their places in the queue; one that is not paused stays as it is."""
+        now = self._clock()
+        with self._database.write() as connection:
+            self._require(connection, grid_id)
+            lock_grids(connection, [grid_id])
+            paused = (grid.c.id == grid_id) & grid.c.paused_at.is_not(None)
+            if connection.execute(update(grid).where(paused).values(paused_at=None)).rowcount:
+                freed = move(connection, RESUME, run.c.grid_id == grid_id)
+                add_event(connection, grid_id, "grid_resumed", now, runs=len(freed))
+            return self._grid(connection, grid_id)
+
+    def revive(self, grid_id: str) -> int:
+        """Queue again every run of a grid that ended without a result; how many.
+
+        Earlier attempts stay on record but are no longer counted against the run. In a paused grid they wait with the
+        others.
+        """
+        now = self._clock()
+        with self._database.write() as connection:
+            self._require(connection, grid_id)
+            lock_grids(connection, [grid_id])
+            fresh = {"not_before": now, "charged_from": run.c.attempt, "finished_at": None, "suspect": False}
             mine = run.c.grid_id == grid_id
             moved = move(connection, REVIVE, mine, error_code=None, error_detail=None, **fresh)
             if moved:
-                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None}
+                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
                 connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))
                 add_event(connection, grid_id, "grid_revived", now, runs=len(moved))
+                pause_queued(connection, mine)
             return len(moved)
 
     def stale_results(self) -> int:
@@ -209,27 +242,19 @@ class GridStore:
         return self._views(connection, [row])[0]
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
-        ids = [row.id for row in rows]
+        now = self._clock()
+        # What has ended does not change, and was counted when it ended.
+        ids = [row.id for row in rows if row.ending is None]
         counted = select(run.c.grid_id, run.c.state, func.count().label("runs")).where(run.c.grid_id.in_(ids))
         counts: dict[str, dict[str, int]] = {grid_id: {} for grid_id in ids}
-        for row in connection.execute(counted.group_by(run.c.grid_id, run.c.state)):
+        for row in connection.execute(counted.group_by(run.c.grid_id, run.c.state)) if ids else ():
             counts[row.grid_id][row.state] = row.runs
-        now = self._clock()
-        return [grid_view(row, counts[row.id], self._recent(connection, row), now) for row in rows]
-
-    @staticmethod
-    def _recent(connection: Connection, row: Row[Any]) -> Recent | None:
-        """What the rate is measured on: the latest runs that were worked on, and when the first of them began."""
-        ended = (
-            select(run.c.finished_at, run.c.leased_at)
-            .where(run.c.grid_id == row.id, run.c.finished_at.is_not(None), run.c.leased_at.is_not(None))
-            .order_by(run.c.finished_at.desc())
-            .limit(_RATE_RUNS)
-        )
-        found = connection.execute(ended).all()
-        if not found:
-            return None
-        return Recent(len(found), min(other.leased_at for other in found), found[0].finished_at)
+        return [
+            grid_view(row, counts[row.id], recent(connection, row.id), now)
+            if row.ending is None
+            else ended_grid_view(row)
+            for row in rows
+        ]
 
     @staticmethod
     def _require(connection: Connection, grid_id: str) -> None:

@@ -20,11 +20,12 @@ class LeadershipLostError(RuntimeError):
 
 @dataclass(frozen=True)
 class LeaderView:
-    """The leader row as last written."""
+    """The leader row as last written: ``workers`` counts threads, ``engines`` those of each engine by its digest."""
 
     generation: int
     holder: str
     workers: int
+    engines: dict[str, int]
     beat_at: datetime
     expires_at: datetime
 
@@ -63,7 +64,7 @@ class Leadership:
         now = self._clock()
         with self._database.write() as connection:
             row = connection.execute(select(leader).where(leader.c.id == 1).with_for_update()).one_or_none()
-            values = {"holder": holder, "workers": 0, "beat_at": now, "expires_at": now + self._ttl}
+            values = {"holder": holder, "workers": 0, "engines": {}, "beat_at": now, "expires_at": now + self._ttl}
             if row is None:
                 # Two first dispatchers: the primary key lets one in, the other gets an IntegrityError and tries again.
                 connection.execute(insert(leader).values(id=1, generation=1, **values))
@@ -75,14 +76,14 @@ class Leadership:
             requeue(connection, run.c.generation < generation, Outcome.DISPATCHER_LOST, now)
             return generation
 
-    def beat(self, generation: int, workers: int) -> bool:
-        """Say that the leader lives and how many worker threads it has; False once another leads."""
+    def beat(self, generation: int, engines: dict[str, int]) -> bool:
+        """Say that the leader lives and how many worker threads it has of each engine; False once another leads."""
         now = self._clock()
         with self._database.write() as connection:
             beaten = connection.execute(
                 update(leader)
                 .where(leader.c.id == 1, leader.c.generation == generation)
-                .values(workers=workers, beat_at=now, expires_at=now + self._ttl)
+                .values(workers=sum(engines.values()), engines=engines, beat_at=now, expires_at=now + self._ttl)
             )
             return beaten.rowcount == 1
 
@@ -91,7 +92,7 @@ class Leadership:
         now = self._clock()
         with self._database.write() as connection:
             mine = (leader.c.id == 1) & (leader.c.generation == generation)
-            connection.execute(update(leader).where(mine).values(workers=0, expires_at=now))
+            connection.execute(update(leader).where(mine).values(workers=0, engines={}, expires_at=now))
 
     def view(self) -> LeaderView | None:
         """The leader row, None before the first dispatcher."""
@@ -99,7 +100,7 @@ class Leadership:
             row = connection.execute(select(leader).where(leader.c.id == 1)).one_or_none()
         if row is None:
             return None
-        return LeaderView(row.generation, row.holder, row.workers, row.beat_at, row.expires_at)
+        return LeaderView(row.generation, row.holder, row.workers, row.engines, row.beat_at, row.expires_at)
 
     def alive(self) -> LeaderView | None:
         """The leader if its lease has not run out."""

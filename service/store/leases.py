@@ -13,26 +13,34 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
 
-from service.store.states import CANCEL, OPEN_STATES, REQUEUE, GridState, RunState, move
+from service.store.pace import recent
+from service.store.states import CANCEL, OPEN_STATES, PAUSE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
 
 
 class Outcome(StrEnum):
-    """How an attempt ended."""
+    """How an attempt ended; only ``error``, ``worker_lost`` and ``deadline`` count against the run."""
 
     DONE = "done"
     ERROR = "error"
     WORKER_LOST = "worker_lost"
+    SUSPECTED = "suspected"
+    OTHER_ENGINE = "other_engine"
     DEADLINE = "deadline"
     CANCELLED = "cancelled"
     HANDED_BACK = "handed_back"
     DISPATCHER_LOST = "dispatcher_lost"
     FORGOTTEN = "forgotten"
+    SCHEDULER_LOST = "scheduler_lost"
 
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to run a run once: whoever holds the token may store its result."""
+    """The right to run a run once: whoever holds the token may store its result.
+
+    ``engine`` is the digest of the engine whose results the grid takes (None: any); a ``suspect`` may have killed a
+    worker, and has to be run alone.
+    """
 
     run_id: str
     grid_id: str
@@ -42,11 +50,16 @@ class Lease:
     digest: str
     spec: dict[str, Any]
     started_at: datetime
+    engine: str | None = None
+    suspect: bool = False
 
     @property
     def key(self) -> str:
-        """Name of the Dask task: never the same twice, so that Dask takes no old answer for a new one."""
-        return f"{self.run_id}-{self.attempt}-{self.token}"
+        """Name of the Dask task: never the same twice, so that Dask takes no old answer for a new one.
+
+        All begin alike: Dask's scheduler keeps statistics for each beginning, and never drops them.
+        """
+        return f"run-{self.run_id}-{self.attempt}-{self.token}"
 
 
 _LEASED = (
@@ -114,15 +127,19 @@ def requeue(
     now: datetime,
     detail: str | None = None,
     not_before: datetime | None = None,
+    suspect: bool = False,
 ) -> list[str]:
-    """Give leased runs back to the queue, or cancel those whose grid was cancelled meanwhile.
+    """Give leased runs back to the queue, or cancel or pause those whose grid was cancelled or paused meanwhile.
 
-    Without ``not_before`` they keep their place at the head of the queue.
+    Without ``not_before`` they keep their place at the head of the queue; as a ``suspect`` they wait in a lane of
+    their own. The ids of those that were not cancelled come back.
     """
     rows = leased(connection, where)
     end_attempts(connection, rows, outcome, now, detail=detail)
     ids = [row.id for row in rows]
-    values = {} if not_before is None else {"not_before": not_before}
+    values: dict[str, Any] = {} if not_before is None else {"not_before": not_before}
+    if suspect:
+        values["suspect"] = True
     moved = move(connection, REQUEUE, run.c.id.in_(ids), **values)
     for row in rows:
         add_event(connection, row.grid_id, "run_requeued", now, row.id, outcome=outcome, attempt=row.attempt)
@@ -130,7 +147,14 @@ def requeue(
     dropped = move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now)
     if dropped:
         close_grids(connection, {row.grid_id for row in rows}, now)
+    pause_queued(connection, run.c.id.in_(ids))
     return [run_id for run_id in moved if run_id not in dropped]
+
+
+def pause_queued(connection: Connection, where: ColumnElement[bool]) -> list[str]:
+    """Take queued runs of paused grids out of the queue; the caller holds the grids' locks."""
+    paused_grids = select(grid.c.id).where(grid.c.paused_at.is_not(None))
+    return move(connection, PAUSE, where, run.c.grid_id.in_(paused_grids))
 
 
 def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) -> None:
@@ -141,8 +165,10 @@ def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) 
             continue
         counted = select(run.c.state, func.count().label("runs")).where(mine).group_by(run.c.state)
         runs = {row.state: row.runs for row in connection.execute(counted)}
-        state = final_state(runs)
-        connection.execute(update(grid).where(grid.c.id == grid_id).values(state=state, finished_at=now))
+        state, latest = final_state(runs), recent(connection, grid_id)
+        ending = {"counts": runs, "rate_per_s": latest and latest.rate()}
+        values = {"state": state, "finished_at": now, "paused_at": None, "ending": ending}
+        connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))
         add_event(connection, grid_id, "grid_finished", now, state=state, runs=runs)
 
 
@@ -155,9 +181,18 @@ def final_state(runs: dict[str, int]) -> GridState:
     return GridState.DONE
 
 
+def new_event(grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any) -> dict[str, Any]:
+    """A row of the outbox."""
+    return {"grid_id": grid_id, "run_id": run_id, "kind": kind, "detail": detail, "created_at": now}
+
+
+def add_events(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
+    """Add to the outbox, in the transaction of the changes that the events report."""
+    connection.execute(insert(event), rows)
+
+
 def add_event(
     connection: Connection, grid_id: str, kind: str, now: datetime, run_id: str | None = None, **detail: Any
 ) -> None:
-    """Add to the outbox, in the transaction of the change that the event reports."""
-    row = {"grid_id": grid_id, "run_id": run_id, "kind": kind, "detail": detail, "created_at": now}
-    connection.execute(insert(event), row)
+    """Add one event to the outbox, in the transaction of the change that it reports."""
+    add_events(connection, [new_event(grid_id, kind, now, run_id, **detail)])

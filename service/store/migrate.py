@@ -44,11 +44,16 @@ def _run(url: str, action: object) -> None:
         raise TypeError(type(action))
     config = Config()
     config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
-    database = Database(url, pooled=False)
+    # Without foreign keys, or SQLite would see a table that a migration copies as the loss of all that refers to it.
+    database = Database(url, pooled=False, foreign_keys=False)
     try:
         # The service's own connection, so that migrations run under the same settings as everything else.
         with database.write() as connection:
             config.attributes["connection"] = connection
             action(config)
+            if database.is_sqlite:
+                broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
+                if broken:
+                    raise RuntimeError(f"the migration would leave rows that refer to nothing: {broken[:5]}")
     finally:
         database.close()

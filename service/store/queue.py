@@ -9,7 +9,7 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import Connection, exists, func, insert, select
+from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, insert, literal_column, select, true
 
 from service.identifiers import new_token, utc_now
 from service.payload import ResultPayload
@@ -19,14 +19,17 @@ from service.store.leases import (
     Lease,
     Outcome,
     add_event,
+    add_events,
     close_grids,
     end_attempts,
     held_by,
     leased,
+    new_event,
     requeue,
 )
 from service.store.results import result_row
-from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, RunState, move
+from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move
+from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
 
 _MAX_DELAY_S = 600.0
@@ -44,8 +47,8 @@ class Stored(StrEnum):
 class Failure:
     """Why an attempt failed, and how many more the run is given.
 
-    ``retries`` counts attempts that ended with the same outcome. A run without any left becomes quarantined where
-    ``suspect`` (it may have killed its worker), else failed.
+    ``retries`` counts attempts that ended with the same outcome. A ``suspect`` (it was alone on a worker that died)
+    is tried again in the suspect lane, and quarantined once no retry is left; others become failed.
     """
 
     outcome: Outcome
@@ -73,17 +76,16 @@ class RunQueue:
         self._clock = clock
         self._retry_delay_s = retry_delay_s
 
-    def waiting(self) -> bool:
+    def waiting(self, engine: str | None = None, *, suspects: bool = False) -> bool:
         """Whether a claim would find a run; asked first, because a look needs no lock and an idle queue is the rule."""
         with self._database.read() as connection:
-            ready = (run.c.state == RunState.QUEUED) & (run.c.not_before <= self._clock())
-            return bool(connection.scalar(select(exists().where(ready))))
+            return bool(connection.scalar(select(exists().where(_ready(self._clock(), engine, suspects)))))
 
-    def claim(self, generation: int, limit: int) -> list[Lease]:
-        """Lease up to ``limit`` runs in the order of the queue.
+    def claim(self, generation: int, limit: int, engine: str | None = None, *, suspects: bool = False) -> list[Lease]:
+        """Lease up to ``limit`` runs in the order of the queue, for workers that carry ``engine`` (None: whichever).
 
-        In one transaction with the look at the leader row, so that a deposed dispatcher cannot claim after the new
-        one has voided its leases.
+        Suspects have a queue of their own: they are claimed by asking for them, and only then. One transaction with
+        the look at the leader row, so that a deposed dispatcher cannot claim after the new one has voided its leases.
 
         Raises
         ------
@@ -93,7 +95,7 @@ class RunQueue:
         now, token = self._clock(), new_token()
         picked = (
             select(run.c.id)
-            .where(run.c.state == RunState.QUEUED, run.c.not_before <= now)
+            .where(_ready(now, engine, suspects))
             .order_by(run.c.not_before, run.c.id)
             .limit(limit)
             .with_for_update(skip_locked=True)
@@ -112,12 +114,20 @@ class RunQueue:
                 leased_at=now,
                 attempt=run.c.attempt + 1,
             )
-            columns = (run.c.id, run.c.grid_id, run.c.attempt, run.c.digest, run.c.spec)
-            claimed = select(*columns).where(run.c.id.in_(ids)).order_by(run.c.not_before, run.c.id)
+            columns = (run.c.id, run.c.grid_id, run.c.attempt, run.c.digest, run.c.spec, run.c.suspect)
+            claimed = (
+                select(*columns, grid.c.engine_digest)
+                .join(grid, grid.c.id == run.c.grid_id)
+                .where(run.c.id.in_(ids))
+                .order_by(run.c.not_before, run.c.id)
+            )
             return [
-                Lease(row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now)
+                Lease(
+                    row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
+                    row.engine_digest, row.suspect,
+                )
                 for row in connection.execute(claimed)
-            ]
+            ]  # fmt: skip
 
     def store(self, lease: Lease, payload: ResultPayload) -> Stored:
         """Store a result if the lease is still valid.
@@ -126,18 +136,46 @@ class RunQueue:
         or has two. A lease that is no longer valid leaves everything as it is; its result is compared with the one
         that was stored instead, because two executions of one run ought to agree.
         """
+        return self.store_all([(lease, payload)])[0]
+
+    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+        """Store several results as :meth:`store` does each, in one transaction: all of them are stored, or none.
+
+        Short runs end faster than a disk can confirm one transaction each.
+        """
         now = self._clock()
         with self._database.write() as connection:
-            rows = leased(connection, held_by(lease))
-            if not rows:
-                return self._stale(connection, lease, payload, now)
-            end_attempts(connection, rows, Outcome.DONE, now)
-            move(connection, FINISH, held_by(lease), finished_at=now, error_code=None, error_detail=None)
-            inputs = connection.scalar(select(run.c.inputs).where(run.c.id == lease.run_id))
-            connection.execute(insert(result), result_row(lease, inputs or {}, payload, now))
-            add_event(connection, lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt)
-            close_grids(connection, [lease.grid_id], now)
-            return Stored.STORED
+            rows = leased(connection, _held_by_any([lease for lease, _ in results]))
+            held = {(row.id, row.token) for row in rows}
+            valid = [(lease, payload) for lease, payload in results if (lease.run_id, lease.token) in held]
+            if valid:
+                self._finish(connection, rows, valid, now)
+            return [
+                Stored.STORED if (lease.run_id, lease.token) in held else self._stale(connection, lease, payload, now)
+                for lease, payload in results
+            ]
+
+    @staticmethod
+    def _finish(
+        connection: Connection,
+        rows: Sequence[Row[*tuple[Any, ...]]],
+        results: Sequence[tuple[Lease, ResultPayload]],
+        now: datetime,
+    ) -> None:
+        """Move leased runs to done with their results; the caller holds the locks."""
+        ids = [lease.run_id for lease, _ in results]
+        end_attempts(connection, rows, Outcome.DONE, now)
+        move(connection, FINISH, run.c.id.in_(ids), finished_at=now, error_code=None, error_detail=None)
+        asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
+        inputs = {row.id: row.inputs for row in asked}
+        stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
+        connection.execute(insert(result), stored)
+        add_to_sums(connection, stored)
+        add_events(
+            connection,
+            [new_event(lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt) for lease, _ in results],
+        )
+        close_grids(connection, {lease.grid_id for lease, _ in results}, now)
 
     def fail(self, lease: Lease, failure: Failure) -> RunState | None:
         """End a failed attempt: back to the queue with a delay while retries are left, else to a terminal state.
@@ -154,8 +192,8 @@ class RunQueue:
             if charged < failure.retries:
                 delay = min(self._retry_delay_s * 2.0**charged, _MAX_DELAY_S) * random.uniform(0.5, 1.5)  # noqa: S311
                 later = now + timedelta(seconds=delay)
-                moved = requeue(connection, held_by(lease), failure.outcome, now, failure.detail, later)
-                return RunState.QUEUED if moved else RunState.CANCELLED
+                requeue(connection, held_by(lease), failure.outcome, now, failure.detail, later, failure.suspect)
+                return RunState(connection.scalars(select(run.c.state).where(run.c.id == lease.run_id)).one())
             end_attempts(connection, rows, failure.outcome, now, failure.code, failure.detail)
             transition = QUARANTINE if failure.suspect else FAIL
             reason = {"error_code": failure.code, "error_detail": failure.detail}
@@ -165,17 +203,32 @@ class RunQueue:
             close_grids(connection, [lease.grid_id], now)
             return transition.target
 
-    def hand_back(self, leases: Sequence[Lease]) -> int:
+    def hand_back(self, leases: Sequence[Lease], outcome: Outcome = Outcome.HANDED_BACK) -> int:
         """Give runs back uncharged, at a stop; how many of the leases were still valid."""
         with self._database.write() as connection:
-            wanted = run.c.id.in_([lease.run_id for lease in leases])
-            mine = wanted & run.c.token.in_({lease.token for lease in leases})
-            return len(requeue(connection, mine, Outcome.HANDED_BACK, self._clock()))
+            return len(requeue(connection, _held_by_any(leases), outcome, self._clock()))
 
     def requeue_lost(self, lease: Lease, outcome: Outcome, detail: str) -> bool:
         """Give one run back uncharged that went missing through no fault of its own."""
         with self._database.write() as connection:
             return bool(requeue(connection, held_by(lease), outcome, self._clock(), detail))
+
+    def suspect(self, leases: Sequence[Lease], detail: str) -> int:
+        """Give back runs one of which may have killed a worker: nobody is charged, all wait in the suspect lane."""
+        with self._database.write() as connection:
+            now = self._clock()
+            return len(requeue(connection, _held_by_any(leases), Outcome.SUSPECTED, now, detail, suspect=True))
+
+    def refuse_engine(self, lease: Lease, engine: str) -> bool:
+        """Give a run back uncharged whose result came from another engine than its grid's.
+
+        With the delay of a retry, or the same worker could take it again at once.
+        """
+        with self._database.write() as connection:
+            now = self._clock()
+            later = now + timedelta(seconds=self._retry_delay_s)
+            detail = f"the worker's engine is {engine}, the grid's is {lease.engine}"
+            return bool(requeue(connection, held_by(lease), Outcome.OTHER_ENGINE, now, detail, later))
 
     def requeue_forgotten(self, generation: int, known: Collection[str]) -> list[str]:
         """Give back runs leased in this generation that the dispatcher does not know of.
@@ -226,3 +279,23 @@ class RunQueue:
             detail = {"attempt": lease.attempt, "same": same}
             add_event(connection, lease.grid_id, "stale_result", now, lease.run_id, **detail)
         return Stored.STALE_SAME if same else Stored.STALE_OTHER
+
+
+def _ready(now: datetime, engine: str | None, suspects: bool) -> ColumnElement[bool]:
+    """Runs that may be claimed for an engine.
+
+    The states are spelt out: a database takes a partial index only where it sees that the condition implies it.
+    """
+    queued = run.c.state == literal_column(f"'{RunState.QUEUED}'")
+    ready = queued & (run.c.suspect == (true() if suspects else false())) & (run.c.not_before <= now)
+    if engine is None:
+        return ready
+    is_open = grid.c.state == literal_column(f"'{GridState.QUEUED}'")
+    others = select(grid.c.id).where(is_open, grid.c.engine_digest != engine)
+    return ready & run.c.grid_id.not_in(others)
+
+
+def _held_by_any(leases: Sequence[Lease]) -> ColumnElement[bool]:
+    """The runs of these leases, as long as the leases are valid."""
+    wanted = run.c.id.in_([lease.run_id for lease in leases])
+    return wanted & run.c.token.in_({lease.token for lease in leases})

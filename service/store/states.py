@@ -15,6 +15,7 @@ class RunState(StrEnum):
     """Where a run stands."""
 
     QUEUED = "queued"
+    PAUSED = "paused"
     LEASED = "leased"
     DONE = "done"
     FAILED = "failed"
@@ -23,16 +24,21 @@ class RunState(StrEnum):
 
 
 class GridState(StrEnum):
-    """Where a grid stands; the first two are told apart by its runs, the others are stored with its last run."""
+    """Where a grid stands.
+
+    The first three are told apart by its runs and by whether somebody paused it, the others are stored with the end
+    of its last run.
+    """
 
     QUEUED = "queued"
     RUNNING = "running"
+    PAUSED = "paused"
     DONE = "done"
     FAILED = "failed"
     CANCELLED = "cancelled"
 
 
-OPEN_STATES = frozenset({RunState.QUEUED, RunState.LEASED})
+OPEN_STATES = frozenset({RunState.QUEUED, RunState.PAUSED, RunState.LEASED})
 TERMINAL_STATES = frozenset(RunState) - OPEN_STATES
 
 
@@ -53,7 +59,9 @@ FINISH = _from(RunState.LEASED, to=RunState.DONE)
 FAIL = _from(RunState.LEASED, to=RunState.FAILED)
 QUARANTINE = _from(RunState.LEASED, to=RunState.QUARANTINED)
 REQUEUE = _from(RunState.LEASED, to=RunState.QUEUED)
-CANCEL = _from(RunState.QUEUED, to=RunState.CANCELLED)
+PAUSE = _from(RunState.QUEUED, to=RunState.PAUSED)
+RESUME = _from(RunState.PAUSED, to=RunState.QUEUED)
+CANCEL = _from(RunState.QUEUED, RunState.PAUSED, to=RunState.CANCELLED)
 CANCEL_RUNNING = _from(RunState.LEASED, to=RunState.CANCELLED)
 REVIVE = _from(RunState.FAILED, RunState.QUARANTINED, RunState.CANCELLED, to=RunState.QUEUED)
 
@@ -63,6 +71,8 @@ TRANSITIONS = {
     "fail": FAIL,
     "quarantine": QUARANTINE,
     "requeue": REQUEUE,
+    "pause": PAUSE,
+    "resume": RESUME,
     "cancel": CANCEL,
     "cancel_running": CANCEL_RUNNING,
     "revive": REVIVE,

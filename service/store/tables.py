@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import (
     JSON,
     BigInteger,
+    Boolean,
     CheckConstraint,
     Column,
     DateTime,
@@ -22,6 +23,7 @@ from sqlalchemy import (
     Text,
     TypeDecorator,
     UniqueConstraint,
+    false,
     text,
 )
 from sqlalchemy.types import TypeEngine
@@ -75,7 +77,19 @@ grid = Table(
     Column("created_at", UtcDateTime, nullable=False),
     Column("finished_at", UtcDateTime),
     Column("cancelled_at", UtcDateTime),
+    Column("paused_at", UtcDateTime),
+    # Whose results are taken; null in grids that are older than this column, which take any engine's.
+    Column("engine_digest", String(64)),
+    # What would otherwise be counted anew with every look; null as long as a run is open.
+    Column("ending", JSON(none_as_null=True)),
     CheckConstraint("state in ('queued', 'done', 'failed', 'cancelled')", name="state"),
+)
+# The grids that are not finished: few, however many have ended.
+Index(
+    "ix_grid_open",
+    grid.c.engine_digest,
+    sqlite_where=text("state = 'queued'"),
+    postgresql_where=text("state = 'queued'"),
 )
 
 run = Table(
@@ -99,16 +113,24 @@ run = Table(
     Column("finished_at", UtcDateTime),
     Column("error_code", String(64)),
     Column("error_detail", Text),
+    # It may have killed a worker: from now on it runs alone.
+    Column("suspect", Boolean, nullable=False, server_default=false()),
     UniqueConstraint("grid_id", "ordinal"),
     UniqueConstraint("grid_id", "digest"),
     CheckConstraint(
-        "state in ('queued', 'leased', 'done', 'failed', 'quarantined', 'cancelled')",
+        "state in ('queued', 'paused', 'leased', 'done', 'failed', 'quarantined', 'cancelled')",
         name="state",
     ),
     # A lease is a state with a token, never the one without the other.
     CheckConstraint("(state = 'leased') = (token is not null)", name="lease_has_token"),
-    Index("ix_run_grid_id_state", "grid_id", "state"),
-    Index("ix_run_grid_id_finished_at", "grid_id", "finished_at"),
+    Index("ix_run_grid_id_state_ordinal", "grid_id", "state", "ordinal"),
+    Index(
+        "ix_run_grid_id_finished_at",
+        "grid_id",
+        "finished_at",
+        sqlite_where=text("finished_at is not null"),
+        postgresql_where=text("finished_at is not null"),
+    ),
 )
 # What a claim reads: the queue in its order, however many finished runs lie beside it.
 Index(
@@ -117,6 +139,14 @@ Index(
     run.c.id,
     sqlite_where=text("state = 'queued'"),
     postgresql_where=text("state = 'queued'"),
+)
+# The suspect lane, which is nearly always empty: a look into it must not go through the queue.
+Index(
+    "ix_run_suspect",
+    run.c.not_before,
+    run.c.id,
+    sqlite_where=text("state = 'queued' and suspect = 1"),
+    postgresql_where=text("state = 'queued' and suspect"),
 )
 Index(
     "ix_run_leased",
@@ -195,6 +225,43 @@ result = Table(
     Column("products_digest", String(64)),
 )
 
+GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
+"""Runs that agree in these are runs of one input."""
+COUNTED = ("at_bound", "failed")
+
+
+def _sum_columns(parts: tuple[str, ...]) -> list[Column[Any]]:
+    columns: list[Column[Any]] = [Column("runs", Integer, nullable=False)]
+    for estimate in ESTIMATES:
+        columns += [Column(f"{estimate}_{name}", BigInteger, nullable=False) for name in COUNTED]
+        for quantity in QUANTITIES:
+            columns += [
+                Column(f"{estimate}_{quantity}_{part}", Integer if part == "bias_runs" else Float, nullable=False)
+                for part in parts
+            ]
+    return columns
+
+
+# Sums over the results of one input and of a whole grid, written by service.store.sums alone.
+input_sum = Table(
+    "input_sum",
+    metadata,
+    Column("grid_id", ForeignKey("grid.id"), primary_key=True),
+    *(
+        Column(column.name, column.type, primary_key=True, autoincrement=False)
+        for column in _input_columns()
+        if column.name in GROUP_COLUMNS
+    ),
+    *_sum_columns(("sd", "bias", "bias_runs", "shift", "shift2")),
+)
+
+grid_sum = Table(
+    "grid_sum",
+    metadata,
+    Column("grid_id", ForeignKey("grid.id"), primary_key=True),
+    *_sum_columns(("sd", "bias", "bias2", "bias_runs")),
+)
+
 attempt = Table(
     "attempt",
     metadata,
@@ -237,6 +304,7 @@ leader = Table(
     Column("generation", BigInteger, nullable=False),
     Column("holder", String(200), nullable=False),
     Column("workers", Integer, nullable=False),
+    Column("engines", JSON, nullable=False, server_default=text("'{}'")),
     Column("beat_at", UtcDateTime, nullable=False),
     Column("expires_at", UtcDateTime, nullable=False),
     CheckConstraint("id = 1", name="single_row"),

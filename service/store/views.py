@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -23,6 +22,7 @@ from service.schemas import (
     RunError,
     RunView,
 )
+from service.store.pace import Recent
 from service.store.states import GridState, RunState
 from service.store.tables import run
 
@@ -30,28 +30,32 @@ RUN_COLUMNS = tuple(
     run.c[name]
     for name in (
         "id", "grid_id", "ordinal", "label", "paper_run", "state", "inputs",
-        "attempt", "error_code", "error_detail", "finished_at",
+        "attempt", "suspect", "error_code", "error_detail", "finished_at",
     )
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Recent:
-    """The latest runs that ended: how many, when the first of them began, when the last ended."""
-
-    runs: int
-    began_at: datetime
-    ended_at: datetime
+def ended_grid_view(row: Row[Any]) -> GridView:
+    """A grid none of whose runs is open, from what was written down at its end."""
+    return _grid_view(row, RunCounts(**row.ending["counts"]), GridState(row.state), row.ending["rate_per_s"], 0.0)
 
 
 def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
-    """A grid with its progress; an unfinished one is running as soon as a run has been started."""
+    """A grid with its progress; an unfinished one that is not paused is running once a run has been started."""
     runs = RunCounts(**counts)
     state = GridState(row.state)
-    if state is GridState.QUEUED and (runs.leased or runs.ended):
+    if state is GridState.QUEUED and row.paused_at is not None:
+        state = GridState.PAUSED
+    elif state is GridState.QUEUED and (runs.leased or runs.ended):
         state = GridState.RUNNING
-    remaining = runs.queued + runs.leased
+    remaining = runs.queued + runs.paused + runs.leased
     rate, left = _pace(recent, remaining, now)
+    if state is GridState.PAUSED:
+        left = None
+    return _grid_view(row, runs, state, rate, left)
+
+
+def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | None, left: float | None) -> GridView:
     return GridView(
         id=row.id,
         name=row.name,
@@ -65,12 +69,14 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
         created_at=row.created_at,
         finished_at=row.finished_at,
         cancelled_at=row.cancelled_at,
+        paused_at=row.paused_at,
+        engine_digest=row.engine_digest,
         request=row.request,
         links={
             "self": f"/v1/grids/{row.id}",
             "runs": f"/v1/grids/{row.id}/runs",
             "summary": f"/v1/grids/{row.id}/summary",
-            "cancel": f"/v1/grids/{row.id}/cancel",
+            **{action: f"/v1/grids/{row.id}/{action}" for action in ("cancel", "pause", "resume", "retry")},
         },
     )
 
@@ -83,10 +89,10 @@ def _pace(recent: Recent | None, remaining: int, now: datetime) -> tuple[float |
     """
     if recent is None:
         return None, 0.0 if not remaining else None
-    rate = recent.runs / max((recent.ended_at - recent.began_at).total_seconds(), 1e-3)
+    rate = recent.rate()
     left = remaining / rate - (now - recent.ended_at).total_seconds()
     if remaining and left <= 0.0:
-        rate = recent.runs / max((now - recent.began_at).total_seconds(), 1e-3)
+        rate = recent.rate(now)
         left = remaining / rate
     return rate, max(left, 0.0) if remaining else 0.0
 
@@ -142,7 +148,7 @@ def result_view(row: Row[Any]) -> ResultView:
 def _run_fields(row: Row[Any]) -> dict[str, Any]:
     state = RunState(row.state)
     error = None if row.error_code is None else RunError(code=row.error_code, detail=row.error_detail)
-    plain = ("id", "grid_id", "ordinal", "label", "paper_run", "inputs", "attempt", "finished_at")
+    plain = ("id", "grid_id", "ordinal", "label", "paper_run", "inputs", "attempt", "suspect", "finished_at")
     return {
         **{name: getattr(row, name) for name in plain},
         "state": state,

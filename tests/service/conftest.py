@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, text
 
+from service.drills.postgres import FAST
+from service.drills.postgres import postgres_server as server
 from service.store.database import Database
 from service.store.migrate import upgrade
 from service.store.tables import metadata
-from tests.service import postgres
 
 
 class Clock:
@@ -36,8 +37,8 @@ def clock() -> Clock:
 
 @pytest.fixture(scope="session")
 def postgres_server() -> Iterator[str]:
-    with postgres.server() as url:
-        yield url
+    with server(FAST) as own:
+        yield own.url("%s")
 
 
 def new_database(server: str, name: str) -> str:

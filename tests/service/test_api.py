@@ -172,6 +172,21 @@ def test_pages_are_linked(api: TestClient) -> None:
     assert len(api.get(grid["links"]["runs"] + "?state=done").json()["items"]) == 0
 
 
+def test_a_grid_is_paused_resumed_and_tried_again(api: TestClient) -> None:
+    grid = api.post("/v1/grids", json=body(3)).json()
+    assert len(grid["engine_digest"]) == 64
+    paused = api.post(grid["links"]["pause"]).json()
+    assert (paused["state"], paused["uws_phase"], paused["counts"]["paused"]) == ("paused", "HELD", 3)
+    assert api.get(f"{grid['links']['runs']}?state=paused").json()["items"][0]["uws_phase"] == "HELD"
+    resumed = api.post(grid["links"]["resume"]).json()
+    assert (resumed["state"], resumed["counts"]["queued"], resumed["paused_at"]) == ("queued", 3, None)
+    assert api.post(grid["links"]["cancel"]).json()["state"] == "cancelled"
+    again = api.post(grid["links"]["retry"]).json()
+    assert (again["state"], again["counts"]["queued"], again["finished_at"]) == ("queued", 3, None)
+    for action in ("pause", "resume", "retry"):
+        assert_problem(api.post(f"/v1/grids/{UNKNOWN_GRID}/{action}"), 404)
+
+
 def test_cancel_ends_a_grid_and_may_be_repeated(api: TestClient) -> None:
     grid = api.post("/v1/grids", json=body(4)).json()
     for _ in range(2):
@@ -193,7 +208,7 @@ def test_the_catalogue_is_shown(api: TestClient) -> None:
 def test_readiness_tells_what_is_missing(api: TestClient, settings: Settings) -> None:
     assert api.get("/healthz").json() == {"status": "ok"}
     assert api.get("/readyz").json() == {
-        "status": "degraded", "database": "ok", "dispatcher": "missing", "workers": 0, "beat_at": None,
+        "status": "degraded", "database": "ok", "dispatcher": "missing", "workers": 0, "engines": {}, "beat_at": None,
     }  # fmt: skip
     database = Database(settings.database)
     leadership = Leadership(database)
@@ -201,7 +216,7 @@ def test_readiness_tells_what_is_missing(api: TestClient, settings: Settings) ->
     assert generation is not None
     answer = api.get("/readyz").json()
     assert (answer["status"], answer["dispatcher"]) == ("degraded", "ok")
-    leadership.beat(generation, 2)
+    leadership.beat(generation, {"e" * 64: 2})
     answer = api.get("/readyz").json()
     assert (answer["status"], answer["workers"]) == ("ready", 2)
     database.close()

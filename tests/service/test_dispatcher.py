@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from sqlalchemy.exc import OperationalError
+from distributed import KilledWorker
+from sqlalchemy.exc import DataError, OperationalError
 
+from engine import engine_digest
+from service.dispatcher.attribution import Deaths
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.loop import Dispatcher
+from service.dispatcher.pool import Worker
 from service.payload import ResultPayload
 from service.settings import Settings
 from service.store.database import Database
@@ -22,20 +28,46 @@ from service.store.leadership import Leadership, LeadershipLostError
 from service.store.leases import Lease
 from service.store.queue import RunQueue, Stored
 from service.store.states import GridState
-from service.worker import call_task
-from tests.service.plans import submit
+from service.worker import call_tasks
+from tests.service.plans import body, planned
 
 
 class Answered:
     """A Dask future that has its answer already, or never gets one."""
 
-    def __init__(self, answer: Any = None, status: str = "finished") -> None:
-        self._answer = answer
+    def __init__(self, leases: Sequence[Lease], status: str) -> None:
+        self.key = leases[0].key
         self.status = status
-        self.key = "key"
+        self._specs = [lease.spec for lease in leases]
+        self._answers: Any = None
+        self._told: Callable[[Any], None] = lambda _: None
+
+    def add_done_callback(self, told: Callable[[Any], None]) -> None:
+        self._told = told
+        if self.done() and self.status not in {"lost", "cancelled"}:
+            told(self)
+
+    def answer(self, folder: Path) -> None:
+        """It has run."""
+        self._answers = call_tasks("tests.service.tasks:fast", self._specs, str(folder))
+        self.status = "finished"
+
+    def kill(self) -> None:
+        """Its worker dies."""
+        self.status = "error"
+        self._told(self)
+
+    def finish(self, folder: Path) -> None:
+        """It ends well, if it has not ended."""
+        if self.status == "pending":
+            self.answer(folder)
+            self._told(self)
+
+    def exception(self, timeout: float) -> BaseException:
+        return KilledWorker(self.key, None, 0)
 
     def result(self, timeout: float) -> Any:
-        return self._answer
+        return self._answers
 
     def done(self) -> bool:
         return self.status != "pending"
@@ -49,26 +81,45 @@ class InstantPool:
 
     running = True
 
-    def __init__(self, folder: Path, *statuses: str) -> None:
+    def __init__(self, folder: Path, *statuses: str, threads: int = 1) -> None:
         self.folder = folder
         self.statuses = list(statuses)
+        self.threads = threads
+        self.addresses = ["a", "b"]
+        self.engine = engine_digest()
         self.stopped: list[Any] = []
         self.submitted: list[str] = []
+        self.batches: list[int] = []
+        self.placed: list[tuple[str, Lease]] = []
+        self.futures: list[Answered] = []
 
-    def threads(self) -> int:
-        return 2
+    def workers(self) -> list[Worker]:
+        return [Worker(address, self.threads, self.engine, 0.0) for address in self.addresses]
 
-    def submit(self, lease: Lease, done: Callable[[Any], None]) -> Answered:
-        self.submitted.append(lease.run_id)
-        status = self.statuses.pop(0) if self.statuses else "finished"
-        answer = call_task("tests.service.tasks:fast", lease.spec, str(self.folder)) if status == "finished" else None
-        future = Answered(answer, status)
-        if status == "finished":
-            done(future)
+    def present(self) -> list[str]:
+        return self.addresses
+
+    def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+        self.submitted += [lease.run_id for lease in leases]
+        self.placed += [(worker.address, lease) for lease in leases]
+        self.batches.append(len(leases))
+        future = Answered(leases, self.statuses.pop(0) if self.statuses else "finished")
+        if future.status == "finished":
+            future.answer(self.folder)
+        self.futures.append(future)
         return future
 
-    def stop(self, future: Any) -> None:
-        self.stopped.append(future)
+    def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
+        self.stopped += futures
+
+    def forget(self, address: str) -> None:
+        pass
+
+    def was_stopped(self, address: str) -> bool:
+        return False
+
+    def closed_on_purpose(self, address: str) -> bool:
+        return False
 
 
 class ShakyQueue(RunQueue):
@@ -77,22 +128,22 @@ class ShakyQueue(RunQueue):
     away = 0
     events: list[str]
 
-    def claim(self, generation: int, limit: int) -> list[Lease]:
+    def claim(self, generation: int, limit: int, engine: str | None = None, *, suspects: bool = False) -> list[Lease]:
         self.events.append("claim")
-        return super().claim(generation, limit)
+        return super().claim(generation, limit, engine, suspects=suspects)
 
-    def store(self, lease: Lease, payload: ResultPayload) -> Stored:
+    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
         if self.away:
             self.away -= 1
             self.events.append("away")
             raise OperationalError("INSERT", {}, Exception("the database is away"))
         self.events.append("store")
-        return super().store(lease, payload)
+        return super().store_all(results)
 
 
 @pytest.fixture(autouse=True)
 def no_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOSTLENS_TEST_SLEEP", "0")
+    monkeypatch.setenv("HOSTLENS_DRILL_SLEEP", "0")
 
 
 @pytest.fixture
@@ -105,24 +156,27 @@ def database(sqlite_url: str) -> Iterator[Database]:
 class Setting:
     """A grid, a queue and a dispatcher that stops when the grid has ended."""
 
-    def __init__(self, database: Database, pool: InstantPool, runs: int, **settings: Any) -> None:
+    def __init__(
+        self, database: Database, pool: InstantPool, runs: int, engine: str | None = None, **settings: Any
+    ) -> None:
         self.grids = GridStore(database)
-        self.grid_id = submit(self.grids, runs)
+        self.grid_id = self.grids.create(body(runs), lambda: planned(runs), engine=engine).grid.id
         self.queue = ShakyQueue(database, retry_delay_s=0.01)
         self.queue.events = []
         self.leadership = Leadership(database)
         generation = self.leadership.take("test")
         assert generation == 1
         self.pool = pool
-        self.heartbeat: Any = SimpleNamespace(workers=0, lost=Event())
+        self.heartbeat: Any = SimpleNamespace(engines={}, lost=Event())
         chosen = Settings(poll_s=0.01, **settings)
-        self.dispatcher = Dispatcher(chosen, self.queue, pool, self.heartbeat, generation)  # type: ignore[arg-type]
+        self.dispatcher = Dispatcher(chosen, self.queue, self.heartbeat, generation)
+        self.dispatcher._deaths = Deaths(judge_after_s=0.05)
 
     def run(self, until: Callable[[], bool] | None = None, steps: int = 200) -> None:
         looks = iter(range(steps))
         ended = until or (lambda: self.grids.grid(self.grid_id).finished_at is not None)
         stop: Any = SimpleNamespace(is_set=lambda: next(looks, None) is None or ended(), wait=lambda _: None)
-        self.dispatcher.run(stop)
+        self.dispatcher.run(self.pool, stop)  # type: ignore[arg-type]
 
 
 def test_a_result_is_kept_while_the_database_is_away_and_nothing_is_claimed_meanwhile(
@@ -133,7 +187,7 @@ def test_a_result_is_kept_while_the_database_is_away_and_nothing_is_claimed_mean
     setting.run()
     assert setting.grids.grid(setting.grid_id).state is GridState.DONE
     assert len(setting.pool.submitted) == len(set(setting.pool.submitted)) == 6
-    assert setting.queue.events[:6] == ["claim", "away", "away", "away", "store", "store"]
+    assert setting.queue.events[:6] == ["claim", "away", "away", "away", "store", "claim"]
 
 
 def test_a_run_that_dask_has_lost_is_run_again_uncharged(database: Database, tmp_path: Path) -> None:
@@ -163,16 +217,146 @@ def test_workers_that_are_away_for_a_moment_keep_their_runs_and_ones_that_stay_a
     pool = InstantPool(tmp_path, "pending", "pending")
     setting = Setting(database, pool, runs=2, reconcile_s=0.001)
     setting.run(until=lambda: len(pool.submitted) == 2)
-    pool.threads = lambda: 0  # type: ignore[method-assign]
+    pool.addresses = []
     setting.run(steps=2)
-    pool.threads = lambda: 2  # type: ignore[method-assign]
+    pool.addresses = ["a", "b"]
     setting.run(steps=1)
     assert setting.grids.grid(setting.grid_id).counts.leased == 2
-    pool.threads = lambda: 0  # type: ignore[method-assign]
+    pool.addresses = []
     setting.run(steps=4)
     assert setting.grids.grid(setting.grid_id).counts.queued == 2
-    del pool.threads
+    pool.addresses = ["c", "d"]
     setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 2
+
+
+def outcomes(setting: Setting) -> list[list[str]]:
+    runs = setting.grids.runs(setting.grid_id, 100).items
+    return [[end.outcome for end in setting.grids.run(run.id).attempts] for run in runs]
+
+
+def test_a_run_alone_on_a_worker_that_died_is_charged_and_tried_again_alone(database: Database, tmp_path: Path) -> None:
+    pool = InstantPool(tmp_path, "error")
+    setting = Setting(database, pool, runs=4)
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 4
+    assert outcomes(setting) == [["worker_lost", "done"], ["done"], ["done"], ["done"]]
+    assert [lease.suspect for _, lease in pool.placed] == [False] * 4 + [True]
+
+
+def test_runs_that_shared_a_dead_worker_are_charged_nothing_and_run_one_at_a_time_alone(
+    database: Database, tmp_path: Path
+) -> None:
+    pool = InstantPool(tmp_path, *["pending"] * 6, threads=3)
+    setting = Setting(database, pool, runs=8)
+    setting.run(until=lambda: len(pool.submitted) == 6)
+    for (address, _), future in list(zip(pool.placed, pool.futures, strict=True)):
+        if address == "a":
+            future.kill()
+    pool.statuses = ["finished", "finished", "pending"]
+    # The two that were never started go to the free places at once; then a suspect gets the worker for itself.
+    setting.run(until=lambda: len(pool.submitted) == 9, steps=2000)
+    assert [lease.suspect for _, lease in pool.placed[6:]] == [False, False, True]
+    assert pool.placed[8][0] == "a"
+    setting.run(steps=3)
+    assert len(pool.submitted) == 9, "a second suspect was started beside the first"
+    for future in pool.futures:
+        future.finish(tmp_path)
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 8
+    assert sorted(outcomes(setting)) == [["done"]] * 5 + [["suspected", "done"]] * 3
+
+
+def test_runs_of_workers_that_died_in_the_same_moment_are_charged_nothing(database: Database, tmp_path: Path) -> None:
+    setting = Setting(database, InstantPool(tmp_path, "error", "error"), runs=3)
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 3
+    assert outcomes(setting) == [["suspected", "done"], ["suspected", "done"], ["done"]]
+
+
+def test_a_run_that_kills_three_workers_is_quarantined_and_no_other_is_charged(
+    database: Database, tmp_path: Path
+) -> None:
+    class Poisoned(InstantPool):
+        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+            self.statuses = ["error" if leases[0].run_id.endswith("1") else "finished"]
+            return super().submit(leases, worker)
+
+    setting = Setting(database, Poisoned(tmp_path), runs=5)
+    setting.run(steps=2000)
+    counts = setting.grids.grid(setting.grid_id).counts
+    assert (counts.done, counts.quarantined) == (4, 1)
+    assert outcomes(setting) == [["done"], ["worker_lost"] * 3, ["done"], ["done"], ["done"]]
+
+
+def test_short_runs_go_several_at_a_time_and_a_death_among_them_charges_only_the_one_that_dies_alone(
+    database: Database, tmp_path: Path
+) -> None:
+    class Poisoned(InstantPool):
+        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+            self.statuses = ["error" if any(lease.run_id.endswith("1") for lease in leases) else "finished"]
+            return super().submit(leases, worker)
+
+    pool = Poisoned(tmp_path)
+    setting = Setting(database, pool, runs=10, batch=4)
+    setting.run(steps=5000)
+    assert pool.batches[:4] == [4, 4, 1, 1]
+    counts = setting.grids.grid(setting.grid_id).counts
+    assert (counts.done, counts.quarantined) == (9, 1)
+    ended = Counter(end for ends in outcomes(setting) for end in ends)
+    assert ended == {"done": 9, "suspected": 4, "worker_lost": 3}
+
+
+def test_one_result_that_the_database_refuses_keeps_no_other_out(database: Database, tmp_path: Path) -> None:
+    class Fussy(ShakyQueue):
+        def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+            if any(lease.spec["seed"] == 3 for lease, _ in results):
+                raise DataError("INSERT", {}, Exception("numeric value out of range"))
+            return super().store_all(results)
+
+    setting = Setting(database, InstantPool(tmp_path), runs=8, batch=4)
+    setting.queue.__class__ = Fussy
+    setting.run()
+    counts = setting.grids.grid(setting.grid_id).counts
+    assert (counts.done, counts.failed) == (7, 1)
+
+
+def test_a_run_whose_worker_left_without_dask_blaming_it_goes_back_uncharged(
+    database: Database, tmp_path: Path
+) -> None:
+    pool = InstantPool(tmp_path, "pending")
+    setting = Setting(database, pool, runs=2)
+    setting.run(until=lambda: len(pool.submitted) == 2)
+    pool.addresses = ["b"]
+    setting.run(steps=2000)
+    assert outcomes(setting) == [["forgotten", "done"], ["done"]]
+
+
+def test_a_worker_with_another_engine_gets_no_run_and_its_answer_is_not_taken(
+    database: Database, tmp_path: Path
+) -> None:
+    pool = InstantPool(tmp_path)
+    setting = Setting(database, pool, runs=1, engine="e" * 64)
+    setting.run(steps=10)
+    assert pool.submitted == []
+    assert setting.heartbeat.engines == {engine_digest(): 2}
+    pool.engine = "e" * 64  # what it said when it was greeted; what it answers with is another
+    setting.run(steps=10)
+    assert len(pool.submitted) >= 1
+    assert {end for ends in outcomes(setting) for end in ends} == {"other_engine"}
+    assert setting.grids.grid(setting.grid_id).counts.done == 0
+
+
+def test_at_a_stop_runs_that_end_soon_are_waited_for(database: Database, tmp_path: Path) -> None:
+    pool = InstantPool(tmp_path, "pending", "pending")
+    setting = Setting(database, pool, runs=2, drain_s=5.0)
+    setting.run(until=lambda: len(pool.submitted) == 2)
+    threading.Timer(0.3, lambda: pool.futures[0].finish(tmp_path)).start()
+    threading.Timer(0.6, lambda: pool.futures[1].finish(tmp_path)).start()
+    began = time.monotonic()
+    setting.dispatcher.drain()
+    setting.dispatcher.hand_back()
+    assert time.monotonic() - began < 3.0
     assert setting.grids.grid(setting.grid_id).counts.done == 2
 
 
@@ -216,7 +400,7 @@ def test_a_heartbeat_outlasts_the_database_and_ends_once_another_leads(database:
     assert not heartbeat.lost.wait(0.5)
     file.rmdir()
     hidden.rename(file)
-    heartbeat.workers = 2
+    heartbeat.engines = {"e": 2}
     until = time.monotonic() + 10
     while (view := leadership.view()) is None or view.workers != 2:
         assert time.monotonic() < until

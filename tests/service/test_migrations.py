@@ -9,10 +9,12 @@ from sqlalchemy import inspect
 
 from service.store.database import Database
 from service.store.grids import GridStore
+from service.store.leadership import Leadership
 from service.store.migrate import differences, downgrade, upgrade
+from service.store.queue import RunQueue, Stored
 from service.store.tables import metadata
 from tests.service.conftest import new_database
-from tests.service.plans import submit
+from tests.service.plans import result_of, submit
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
@@ -32,6 +34,20 @@ def test_migrated_databases_are_what_the_code_expects(empty_url: str) -> None:
     grid_id = submit(grids, 2)
     upgrade(empty_url)
     assert grids.grid(grid_id).n_runs == 2
+    # Down one revision and up again with runs that other tables refer to, one of them paused.
+    generation = Leadership(database).take("test")
+    assert generation == 1
+    queue = RunQueue(database)
+    (lease,) = queue.claim(generation, 1)
+    assert queue.store(lease, result_of(lease)) is Stored.STORED
+    grids.pause(grid_id)
+    database.close()
+    downgrade(empty_url, "0001")
+    upgrade(empty_url)
+    assert differences(empty_url) is None
+    again = grids.grid(grid_id)
+    assert (again.counts.done, again.counts.queued, again.state) == (1, 1, "running")
+    assert grids.run(lease.run_id).result is not None
     downgrade(empty_url, "base")
     assert set(inspect(database.engine).get_table_names()) <= {"alembic_version"}
     upgrade(empty_url)

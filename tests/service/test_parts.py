@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from distributed import KilledWorker
 from fastapi.testclient import TestClient
 from matplotlib.figure import Figure
 from pydantic import ValidationError
@@ -23,7 +22,7 @@ from engine.spec import Analysis
 from service.api.app import create_app
 from service.artefacts import ArtefactStore
 from service.cli import app
-from service.dispatcher.endings import clean, read_answer, read_exception
+from service.dispatcher.endings import OtherEngine, clean, read_answer, read_exception
 from service.dispatcher.holder import is_dead, own_name
 from service.identifiers import utc_now
 from service.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
@@ -116,8 +115,11 @@ def test_answers_are_judged() -> None:
         ending = read_answer(lease(), answer)
         assert isinstance(ending, Failure)
         assert (ending.code, ending.retries) == ("invalid_result", 0)
-    killed = read_exception(KilledWorker("key", None, 1))
-    assert (killed.outcome, killed.suspect) == (Outcome.WORKER_LOST, True)
+    assert read_exception(ValueError("x")).outcome is Outcome.ERROR
+    mine = dataclasses.replace(lease(), engine="e" * 64)
+    assert read_answer(mine, {**good, "engine": "e" * 64}) == read_payload(good["payload"])
+    assert read_answer(mine, {**good, "engine": "f" * 64}) == OtherEngine("f" * 64)
+    assert read_answer(mine, good) == OtherEngine("None")
     assert clean("a\x00b\ud800") == "a\ufffdb?"
 
 
@@ -172,7 +174,10 @@ def test_the_command_line_speaks_to_the_api(tmp_path: Path, sqlite_url: str, mon
         assert "queued" in run.invoke(app, ["status", grid, "--runs"]).output
         assert '"n_stored": 0' in run.invoke(app, ["results", grid, "--json"]).output
         assert "0 of 4 runs stored" in run.invoke(app, ["results", grid]).output
+        assert "paused: 0/4 stored, 4 paused" in run.invoke(app, ["pause", grid]).output
+        assert "queued: 0/4 stored" in run.invoke(app, ["resume", grid]).output
         assert "4 cancelled" in run.invoke(app, ["cancel", grid]).output
+        assert "queued: 0/4 stored" in run.invoke(app, ["retry", grid]).output
         refused = run.invoke(app, ["submit", "--preset", "other"])
         assert refused.exit_code == 1
         assert "/preset" in refused.output
@@ -204,3 +209,15 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     with np.load(store.path(payload.products.key), allow_pickle=False) as arrays:
         assert set(arrays) == {"image", "model", "names"}
         assert arrays["image"].shape == (4, 5)
+
+
+def test_a_worker_is_greeted_with_its_engine_one_thread_and_warm_kernels() -> None:
+    """In a process of its own, as a worker started elsewhere is: without any of the variables that pin threads."""
+    code = (
+        "from service.worker import greet; said = greet('service.worker:execute'); "
+        "print(said.engine, set(said.threads.values()), f'{said.warm_s:.1f}')"
+    )
+    plain = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", code], env=plain, capture_output=True, text=True, check=True)
+    print(f"warm after {done.stdout.split()[-1]} s")
+    assert done.stdout.split()[:2] == [engine.engine_digest(), "{1}"]

@@ -14,6 +14,7 @@ import pytest
 from sqlalchemy import func, select
 
 from service.store.database import Database
+from service.store.leadership import Leadership
 from service.store.tables import attempt, result
 from tests.service.conftest import new_database
 from tests.service.plans import body
@@ -43,7 +44,7 @@ def test_every_run_is_stored_once_through_kills_of_the_dispatcher(
     if backend == "postgresql":
         url = new_database(request.getfixturevalue("postgres_server"), f"kills_{os.getpid()}")
     kills = 2 if backend == "sqlite" else 1
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0.4", HOSTLENS_DATABASE_URL=url) as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.4", HOSTLENS_DATABASE_URL=url) as service:
         before = {process.pid for process in service.processes()}
         grid = service.client.submit(body(24))
         for number in range(kills):
@@ -75,7 +76,7 @@ def test_every_run_is_stored_once_through_kills_of_the_dispatcher(
 
 
 def test_ctrl_c_in_the_middle_of_a_grid_leaves_no_process_and_hands_runs_back(tmp_path: Path) -> None:
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="30") as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="30") as service:
         grid = service.client.submit(body(4))
         eventually(lambda: service.client.status(grid.id).counts.leased == 2, what="two runs in flight")
         started = time.monotonic()
@@ -89,7 +90,7 @@ def test_ctrl_c_in_the_middle_of_a_grid_leaves_no_process_and_hands_runs_back(tm
 
 
 def test_a_killed_supervisor_takes_everything_with_it(tmp_path: Path) -> None:
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="30") as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="30") as service:
         grid = service.client.submit(body(2))
         eventually(lambda: service.client.status(grid.id).counts.leased == 2, what="two runs in flight")
         service.process.kill()
@@ -97,7 +98,7 @@ def test_a_killed_supervisor_takes_everything_with_it(tmp_path: Path) -> None:
 
 
 def test_workers_of_a_dispatcher_without_supervisor_end_with_it(tmp_path: Path) -> None:
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0.1") as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.1") as service:
         service.end()
         alone = subprocess.Popen(
             [sys.executable, "-m", "service.dispatcher"],
@@ -115,7 +116,7 @@ def test_workers_of_a_dispatcher_without_supervisor_end_with_it(tmp_path: Path) 
 
 def test_each_failure_ends_as_promised_and_cancel_stops_running_runs(tmp_path: Path) -> None:
     settings = {"HOSTLENS_TASK": "tests.service.tasks:moody", "HOSTLENS_RETRY_DELAY_S": "0.1"}
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0.1", **settings) as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.1", **settings) as service:
         grid = service.client.submit(body(6))
         ended = service.client.wait(grid.id, timeout_s=90)
         assert (ended.state, ended.counts.done) == ("failed", 2)
@@ -131,7 +132,7 @@ def test_each_failure_ends_as_promised_and_cancel_stops_running_runs(tmp_path: P
 
 
 def test_cancel_stops_running_runs_within_fifteen_seconds(tmp_path: Path) -> None:
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="60", HOSTLENS_DEADLINE_S="3600") as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="60", HOSTLENS_DEADLINE_S="3600") as service:
         grid = service.client.submit(body(20))
         eventually(lambda: service.client.status(grid.id).counts.leased == 2, what="two runs in flight")
         started = time.monotonic()
@@ -141,7 +142,7 @@ def test_cancel_stops_running_runs_within_fifteen_seconds(tmp_path: Path) -> Non
         print(f"cancelled after {time.monotonic() - started:.1f} s")
         assert ended.counts.cancelled == 20
         # The workers are free again, not asleep for the rest of the minute.
-        service.environment["HOSTLENS_TEST_SLEEP"] = "0"
+        service.environment["HOSTLENS_DRILL_SLEEP"] = "0"
         eventually(lambda: (now := service.readiness()) and now.workers == 2, 30, what="two workers again")
 
 
@@ -161,7 +162,7 @@ def test_a_second_service_on_the_same_port_says_so_and_starts_nothing(tmp_path: 
 
 
 def test_a_second_dispatcher_stands_by_and_claims_nothing(tmp_path: Path) -> None:
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0.2") as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.2") as service:
         standby = subprocess.Popen(
             [sys.executable, "-m", "service.dispatcher"],
             cwd=ROOT,
@@ -178,3 +179,39 @@ def test_a_second_dispatcher_stands_by_and_claims_nothing(tmp_path: Path) -> Non
         _, said = standby.communicate(timeout=20)
         assert standby.returncode == 0
         assert "leading" not in said
+
+
+def test_a_standby_takes_over_from_a_leader_that_is_killed(tmp_path: Path) -> None:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.2") as service:
+        standby = subprocess.Popen(
+            [sys.executable, "-m", "service.dispatcher"],
+            cwd=ROOT,
+            env=service.environment,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        database = Database(f"sqlite:///{tmp_path / 'data' / 'hostlens.sqlite'}")
+        leadership = Leadership(database)
+        # Time to stand by: it asks every second, the supervisor starts another only after the first has ended.
+        time.sleep(3)
+        grid = service.client.submit(body(30))
+        eventually(lambda: service.client.status(grid.id).counts.done > 2, what="progress")
+        first = leadership.view()
+        leader = service.child("service.dispatcher")
+        assert first is not None
+        assert leader is not None
+        if f"|{standby.pid}|" in first.holder:
+            os.kill(standby.pid, signal.SIGKILL)
+        else:
+            leader.kill()
+        view = eventually(
+            lambda: (now := leadership.alive()) and now.generation > first.generation and now, 10, "a new leader"
+        )
+        assert view.holder != first.holder
+        ended = service.client.wait(grid.id, timeout_s=60)
+        assert ended.counts.done == 30
+        assert stored_once(database, grid.id) == 30
+        database.close()
+        if standby.poll() is None:
+            standby.terminate()
+        standby.wait(timeout=20)

@@ -42,7 +42,7 @@ def test_only_an_explicit_retry_leaves_a_terminal_state() -> None:
     leaving = {name for name, transition in TRANSITIONS.items() if transition.sources & TERMINAL_STATES}
     assert leaving == {"revive"}
     assert RunState.DONE not in TRANSITIONS["revive"].sources
-    assert {RunState.QUEUED, RunState.LEASED} == OPEN_STATES
+    assert {RunState.QUEUED, RunState.PAUSED, RunState.LEASED} == OPEN_STATES
 
 
 def test_the_database_refuses_a_lease_without_a_token(database: Database, run_id: str) -> None:

@@ -1,0 +1,153 @@
+"""Where the workers come from: this machine, a scheduler elsewhere, Slurm or Kubernetes. Dask executes, keeps nothing.
+
+Slurm and Kubernetes need the extras of that name; nothing of them is imported otherwise.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import dask
+from distributed import Client, LocalCluster, Security
+
+from service.settings import Settings
+
+ONE_THREAD = {f"{name}_NUM_THREADS": 1 for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")}
+"""Environment of a worker: the queue keeps its cores busy, and threads below a run would only fight for them."""
+
+_OUR_RULES = {
+    "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
+    "DASK_DISTRIBUTED__SCHEDULER__WORK_STEALING": "false",
+}
+_CONNECT_S = 5  # a stop has to wait for it
+_STOP_S = 5.0
+
+
+def dask_config(settings: Settings) -> dict[str, Any]:
+    """Dask's configuration where the scheduler or the workers are started from here."""
+    return {
+        # The first death of a worker comes to us: how often a run may be tried again is the queue's decision.
+        "distributed.scheduler.allowed-failures": 0,
+        "distributed.scheduler.work-stealing": False,
+        "distributed.scheduler.worker-ttl": f"{settings.worker_ttl_s} s",
+        # Dask pins all of these but NUMBA_NUM_THREADS by itself.
+        "distributed.nanny.pre-spawn-environ": ONE_THREAD,
+        "distributed.worker.daemon": True,
+        "distributed.comm.timeouts.connect": "10s",
+        # Dask looks at itself fifty times a second in each process, for a dashboard that nobody sees; on two cores
+        # this took 7 % of one from the engine.
+        "distributed.admin.tick.interval": "500ms",
+        "distributed.admin.system-monitor.interval": "5s",
+        "distributed.worker.profile.enabled": False,
+        "temporary-directory": settings.scratch,
+    }
+
+
+@contextmanager
+def open_client(settings: Settings) -> Iterator[Any]:
+    """A client of the workers that the settings ask for; OSError where a scheduler elsewhere does not answer."""
+    with dask.config.set(dask_config(settings)):
+        if settings.kind_of_cluster == "address":
+            security = security_of(settings)
+            address = settings.scheduler_address
+            with Client(address, timeout=f"{_CONNECT_S} s", set_as_default=False, security=security) as client:
+                # By value, so that the scheduler need not have this package: it only schedules.
+                client.run_on_scheduler(_first_death_is_ours())
+                yield client
+            return
+        cluster = _CLUSTERS[settings.kind_of_cluster](settings)
+        try:
+            with Client(cluster, set_as_default=False) as client:
+                yield client
+        finally:
+            cluster.close(timeout=_STOP_S)
+
+
+def security_of(settings: Settings) -> Security | None:
+    """TLS in both directions, None where the settings name no certificates."""
+    if settings.tls_ca is None:
+        return None
+    return Security(
+        require_encryption=True,
+        tls_ca_file=str(settings.tls_ca),
+        tls_client_cert=str(settings.tls_cert),
+        tls_client_key=str(settings.tls_key),
+    )
+
+
+def _first_death_is_ours() -> Any:
+    def rule(dask_scheduler: Any) -> None:
+        dask_scheduler.allowed_failures = 0
+
+    return rule
+
+
+def _local(settings: Settings) -> Any:
+    return LocalCluster(
+        n_workers=settings.workers,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        memory_limit=settings.worker_memory,
+        silence_logs=logging.ERROR,
+    )
+
+
+def slurm(settings: Settings, *, submit: bool = True) -> Any:
+    """Workers as Slurm jobs, one thread each; ModuleNotFoundError without the extra ``slurm``.
+
+    Without ``submit`` no job is started, and ``job_script()`` shows what it would be.
+    """
+    from dask_jobqueue.slurm import SLURMCluster  # noqa: PLC0415 - an extra
+
+    cluster = SLURMCluster(
+        queue=settings.slurm_queue,
+        account=settings.slurm_account,
+        walltime=settings.slurm_walltime,
+        interface=settings.slurm_interface,
+        cores=settings.slurm_workers_per_job,
+        processes=settings.slurm_workers_per_job,
+        memory=settings.slurm_memory,
+        local_directory=settings.scratch,
+        job_script_prologue=[f"export {name}={value}" for name, value in ONE_THREAD.items()] + settings.slurm_prologue,
+        job_extra_directives=settings.slurm_directives,
+        worker_extra_args=["--nanny", "--death-timeout", "120"],
+        scheduler_options={"dashboard": False},
+    )
+    if submit:
+        cluster.scale(settings.workers)
+    return cluster
+
+
+def kubernetes_spec(settings: Settings) -> dict[str, Any]:
+    """The DaskCluster resource that the Kubernetes operator makes pods of; needs the extra ``kubernetes``."""
+    from dask_kubernetes.operator import make_cluster_spec  # noqa: PLC0415 - an extra
+
+    spec: dict[str, Any] = make_cluster_spec(
+        name=settings.kubernetes_name,
+        image=settings.kubernetes_image,
+        n_workers=settings.workers,
+        resources={
+            "requests": {"cpu": "1", "memory": settings.kubernetes_memory},
+            "limits": {"memory": settings.kubernetes_memory},
+        },
+        env={name: str(value) for name, value in ONE_THREAD.items()} | _OUR_RULES,
+        worker_command="dask worker",
+    )
+    worker = spec["spec"]["worker"]["spec"]["containers"][0]
+    worker["args"] = [*worker["args"], "--nthreads", "1"]
+    return spec
+
+
+def kubernetes(settings: Settings) -> Any:
+    """Workers as pods of the Dask operator; ModuleNotFoundError without the extra ``kubernetes``."""
+    from dask_kubernetes.operator import KubeCluster  # noqa: PLC0415 - an extra
+
+    return KubeCluster(namespace=settings.kubernetes_namespace, custom_cluster_spec=kubernetes_spec(settings))
+
+
+_CLUSTERS = {"local": _local, "slurm": slurm, "kubernetes": kubernetes}

@@ -1,0 +1,96 @@
+"""What every drill is: sizes, a place to take place in, and a report."""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from service.drills.report import Report
+from service.store.database import Database
+from service.store.grids import GridStore
+from service.store.migrate import upgrade
+
+BODY: dict[str, Any] = {
+    "preset": "h0licow-vi/HE0435", "n": [2], "magnitude": [20.5], "l_eta": [1.0], "r_eff": [0.39],
+}  # fmt: skip
+
+
+def body(runs: int, seed: int = 0) -> dict[str, Any]:
+    """A request for ``runs`` runs of one input, which differ in their seed."""
+    return {**BODY, "replicates": runs, "seed": seed}
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where a drill takes place: a folder, and a database elsewhere if it is not to be a SQLite file there."""
+
+    folder: Path
+    database_url: str | None = None
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """The database as the service's settings."""
+        return {} if self.database_url is None else {"HOSTLENS_DATABASE_URL": self.database_url}
+
+    @property
+    def backend(self) -> str:
+        """The kind of database, for the report."""
+        return "SQLite" if self.database_url is None or self.database_url.startswith("sqlite") else "PostgreSQL"
+
+
+class OccupiedError(ValueError):
+    """A drill was pointed at a database that holds somebody's grids."""
+
+
+@contextmanager
+def ground(database_url: str | None = None) -> Iterator[Ground]:
+    """A temporary place.
+
+    Raises
+    ------
+    OccupiedError
+        The database holds grids: a drill kills what it finds, so it wants one of its own.
+    """
+    if database_url is not None:
+        upgrade(database_url)
+        database = Database(database_url, pooled=False)
+        if GridStore(database).grids(1).items:
+            raise OccupiedError(f"the database {database.url} holds grids; a drill needs an empty one")
+    with tempfile.TemporaryDirectory(prefix="hostlens-drill-", ignore_cleanup_errors=True) as folder:
+        yield Ground(Path(folder), database_url)
+
+
+class Drill(ABC):
+    """One drill; its fields are its sizes, and the defaults those that the documentation speaks of."""
+
+    name: ClassVar[str]
+    what: ClassVar[str]
+    """What is done to the service, for the list."""
+    claim: ClassVar[str]
+    """What must hold, for the list."""
+    small: ClassVar[dict[str, Any]] = {}
+    """Sizes that take seconds."""
+
+    @abstractmethod
+    def run(self, ground: Ground) -> Report:
+        """Carry it out; a DrillError where that is not possible."""
+
+    @classmethod
+    def sized(cls, changes: dict[str, str], *, small: bool) -> Self:
+        """A drill with its default or small sizes and with some of them changed; ValueError names what is wrong."""
+        known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
+        sizes: dict[str, Any] = dict(cls.small) if small else {}
+        for name, value in changes.items():
+            if name not in known:
+                raise ValueError(f"drill {cls.name} has no size {name}: it has {', '.join(known) or 'none'}")
+            kind: Callable[[str], Any] = type(known[name].default)
+            try:
+                sizes[name] = kind(value)
+            except ValueError:
+                raise ValueError(f"{name}: got {value!r}, allowed is a number") from None
+        return cls(**sizes)

@@ -1,0 +1,158 @@
+"""Operations of the store, and a process that dies at a chosen boundary between two of their statements.
+
+The boundaries are the moment before each statement, the one before the commit and the one after it, as SQLAlchemy
+tells of them: whatever an operation comes to consist of, none is forgotten.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, event
+
+from service.store.database import Database
+from service.store.grids import GridStore
+from service.store.leadership import Leadership
+from service.store.leases import Lease, Outcome
+from service.store.queue import Failure, RunQueue
+from tests.service.plans import body, planned, result_of, submit
+
+DEAD = 9
+BROKEN = Failure(Outcome.ERROR, "error", "broken", retries=1)
+PERMANENT = Failure(Outcome.ERROR, "error", "broken", retries=0)
+CRASHED = Failure(Outcome.WORKER_LOST, "worker_lost", "gone", retries=0, suspect=True)
+
+
+@dataclass(frozen=True)
+class Stores:
+    """One process' view of a database."""
+
+    database: Database
+    grids: GridStore
+    queue: RunQueue
+    leadership: Leadership
+
+    def lead(self) -> int:
+        """Lead, whoever led before."""
+        generation = self.leadership.take("mine", lambda _: True)
+        assert generation is not None
+        return generation
+
+
+@contextmanager
+def stores(url: str) -> Iterator[Stores]:
+    database = Database(url, pooled=False)
+    # Without delay, so that what is given back can be claimed at once.
+    yield Stores(database, GridStore(database), RunQueue(database, retry_delay_s=0.0), Leadership(database))
+    database.close()
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A grid with four runs, two of them leased, and another grid that waits."""
+
+    grid_id: str
+    generation: int
+    leases: tuple[Lease, ...]
+
+
+def prepare(mine: Stores) -> Scene:
+    grid_id = submit(mine.grids, 4)
+    submit(mine.grids, 1, seed=50)
+    generation = mine.lead()
+    return Scene(grid_id, generation, tuple(mine.queue.claim(generation, 2)))
+
+
+def _paused(mine: Stores) -> Scene:
+    scene = prepare(mine)
+    mine.grids.pause(scene.grid_id)
+    return scene
+
+
+def _cancelled(mine: Stores) -> Scene:
+    scene = prepare(mine)
+    mine.grids.cancel(scene.grid_id)
+    return scene
+
+
+def _failed(mine: Stores) -> Scene:
+    scene = prepare(mine)
+    for lease in scene.leases:
+        mine.queue.fail(lease, PERMANENT)
+    return scene
+
+
+def _last(mine: Stores) -> Scene:
+    """A grid whose last run is under way."""
+    grid_id = submit(mine.grids, 1)
+    generation = mine.lead()
+    return Scene(grid_id, generation, tuple(mine.queue.claim(generation, 1)))
+
+
+@dataclass(frozen=True)
+class Operation:
+    """What a process was about to do when it died, and what was there before."""
+
+    act: Callable[[Stores, Scene], object]
+    prepare: Callable[[Stores], Scene] = prepare
+
+
+def _submit(mine: Stores, _: Scene) -> object:
+    return mine.grids.create(body(3, 99), lambda: planned(3, 99), key="once")
+
+
+def _store(mine: Stores, scene: Scene) -> object:
+    return mine.queue.store(scene.leases[0], result_of(scene.leases[0]))
+
+
+OPERATIONS = {
+    "submit": Operation(_submit),
+    "claim": Operation(lambda mine, scene: mine.queue.claim(scene.generation, 2)),
+    "store": Operation(lambda mine, scene: mine.queue.store(scene.leases[0], result_of(scene.leases[0]))),
+    "store the last": Operation(
+        lambda mine, scene: mine.queue.store(scene.leases[0], result_of(scene.leases[0])), _last
+    ),
+    "retry": Operation(lambda mine, scene: mine.queue.fail(scene.leases[0], BROKEN)),
+    "fail": Operation(lambda mine, scene: mine.queue.fail(scene.leases[0], PERMANENT)),
+    "quarantine the last": Operation(lambda mine, scene: mine.queue.fail(scene.leases[0], CRASHED), _last),
+    "suspect": Operation(lambda mine, scene: mine.queue.suspect(scene.leases, "one of two")),
+    "refuse": Operation(lambda mine, scene: mine.queue.refuse_engine(scene.leases[0], "0" * 64)),
+    "hand back": Operation(lambda mine, scene: mine.queue.hand_back(scene.leases)),
+    "hand back cancelled": Operation(lambda mine, scene: mine.queue.hand_back(scene.leases), _cancelled),
+    "hand back paused": Operation(lambda mine, scene: mine.queue.hand_back(scene.leases), _paused),
+    "requeue": Operation(lambda mine, scene: mine.queue.requeue_forgotten(scene.generation, [])),
+    "take-over": Operation(lambda mine, _: mine.lead()),
+    "cancel": Operation(lambda mine, scene: mine.grids.cancel(scene.grid_id)),
+    "cancel running": Operation(lambda mine, scene: mine.queue.cancel_leased(scene.leases[0]), _cancelled),
+    "pause": Operation(lambda mine, scene: mine.grids.pause(scene.grid_id)),
+    "resume": Operation(lambda mine, scene: mine.grids.resume(scene.grid_id), _paused),
+    "revive": Operation(lambda mine, scene: mine.grids.revive(scene.grid_id), _failed),
+}
+
+
+def die_at(url: str, name: str, scene: Scene, boundary: int) -> None:
+    """Carry out an operation in this process, and die without a word at its ``boundary``-th boundary."""
+    with stores(url) as mine:
+        passed = 0
+
+        def boundary_passed(*_: Any, **__: Any) -> None:
+            nonlocal passed
+            passed += 1
+            if passed == boundary:
+                os._exit(DEAD)
+
+        event.listen(mine.database.engine, "before_cursor_execute", boundary_passed)
+        event.listen(mine.database.engine, "commit", _before(boundary_passed))
+        event.listen(mine.database.engine.pool, "reset", boundary_passed)
+        OPERATIONS[name].act(mine, scene)
+
+
+def _before(passed: Callable[[], None]) -> Callable[[Connection], None]:
+    def committing(_: Connection) -> None:
+        passed()
+
+    return committing

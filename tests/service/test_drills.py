@@ -1,0 +1,101 @@
+"""The drills, small: each claim is made of real processes and real signals, and each must hold."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import psutil
+import pytest
+from typer.testing import CliRunner
+
+from service.cli import app
+from service.drills.command import DRILLS
+from service.drills.drill import Ground, OccupiedError, ground
+from service.drills.outages import DiskFull, PostgresKills, SqliteLock
+from service.drills.report import Report, quantile
+from service.drills.requests import Cancel, Idempotency
+from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
+from service.drills.scale import Overhead, Throughput
+from service.drills.volume import Listing, Submission
+from service.store.database import Database
+from service.store.grids import GridStore
+from tests.service.plans import submit
+
+
+def unmet(report: Report) -> list[str]:
+    return [claim.text for claim in report.claims if not claim.holds]
+
+
+def nobody_left(folder: Path) -> bool:
+    return not [process for process in psutil.process_iter() if _is_at(process, folder)]
+
+
+def _is_at(process: psutil.Process, folder: Path) -> bool:
+    try:
+        return str(folder) in process.environ().get("HOSTLENS_DATA_DIR", "")
+    except psutil.Error:
+        return False
+
+
+@pytest.mark.parametrize(
+    "drill",
+    [
+        pytest.param(PostgresKills(runs=12, every_s=3.0), marks=pytest.mark.postgres),
+        SqliteLock(runs=8, lock_s=2.0),
+        DiskFull(runs=8, full_s=1.5),
+        StoppedWorker(runs=6, deadline_s=3.0),
+        TwoDispatchers(runs=20),
+        Poison(runs=24, batch=4),
+        Cancel(runs=1000),
+        Idempotency(clients=20, runs=20),
+    ],
+    ids=lambda drill: drill.name,
+)
+def test_what_the_drill_claims_holds_and_nobody_is_left(drill: object, tmp_path: Path) -> None:
+    report = drill.run(Ground(tmp_path))  # type: ignore[attr-defined]
+    assert unmet(report) == []
+    assert nobody_left(tmp_path)
+
+
+def test_drills_of_scale_measure_what_they_say(tmp_path: Path) -> None:
+    """That the figures come out and nothing is lost; how fast it is depends on who else is at the machine."""
+    throughput = Throughput(runs=300).run(Ground(tmp_path / "throughput"))
+    assert "300 runs done, each stored once" not in unmet(throughput)
+    assert float(throughput.value("rate")) > 0
+    assert "every run is queued" not in unmet(Submission(runs=500).run(Ground(tmp_path / "submission")))
+    listing = Listing(large=480, copies=2, papers=1, requests=2).run(Ground(tmp_path / "listing"))
+    assert listing.value("stored results") == 2 * 480 * 2 + 384 + 240
+    assert "6 runs done, each stored once" not in unmet(Overhead(runs=6, sleep_s=0.2).run(Ground(tmp_path / "over")))
+    assert nobody_left(tmp_path)
+
+
+def test_the_command_shows_writes_and_ends_as_the_claims_say(tmp_path: Path) -> None:
+    run = CliRunner()
+    listed = run.invoke(app, ["drill", "list"])
+    assert listed.exit_code == 0
+    assert all(name in listed.output for name in DRILLS)
+    file = tmp_path / "report.json"
+    done = run.invoke(app, ["drill", "idempotency", "clients=5", "runs=3", "--json", str(file)])
+    assert done.exit_code == 0, done.output
+    document = json.loads(file.read_text())
+    assert document["holds"]
+    assert {figure["name"]: figure["value"] for figure in document["figures"]}["grids"] == 1
+    for wrong in (["nonsense"], ["cancel", "days=3"], ["cancel", "runs=many"]):
+        assert run.invoke(app, ["drill", *wrong]).exit_code == 2
+    assert run.invoke(app, ["drill", "cancel", "fast"]).exit_code == 1
+
+
+def test_a_drill_refuses_a_database_with_grids(sqlite_url: str) -> None:
+    database = Database(sqlite_url)
+    submit(GridStore(database), 1)
+    database.close()
+    with pytest.raises(OccupiedError, match="holds grids"), ground(sqlite_url):
+        pass
+
+
+def test_quantiles_are_of_the_nearest_rank() -> None:
+    assert quantile([3.0, 1.0, 2.0], 0.5) == 2.0
+    assert quantile([1.0, 2.0], 0.99) == 2.0
+    with pytest.raises(ValueError, match="no values"):
+        quantile([], 0.5)
