@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The constraints hold for build dependencies too, hence also as a variable.
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet -c constraints.txt
 
-.PHONY: help demo serve test lint bench clean install install-test
+.PHONY: help demo serve test lint bench tables clean install install-test
 .DEFAULT_GOAL := help
 
 help:
@@ -14,6 +14,7 @@ help:
 	@echo "make test    ruff, mypy and all tests"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   benchmarks: the answer asserted, then the time as a ratio to a peer"
+	@echo "make tables  the tables in docs/tables: error, time and memory of each step of the simulation"
 	@echo "make clean   remove the virtual environment and caches (not var/, where data lies)"
 
 $(BIN)/python:
@@ -57,6 +58,9 @@ bench: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.deflection
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.rendering
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence
+
+tables: install-test
+	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation --write docs/tables/simulation.md
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
