@@ -80,11 +80,11 @@ def serve(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of database and artefacts")] = None,
 ) -> None:
     """Run the service (API, dispatcher, workers) until Ctrl-C."""
-    from service.supervisor import serve as supervise  # noqa: PLC0415 - alembic takes a while, and status needs none
+    from service import logs  # noqa: PLC0415 - alembic takes a while, and status needs none
+    from service.supervisor import serve as supervise  # noqa: PLC0415 - as above
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    logging.getLogger("alembic").setLevel(logging.WARNING)
     settings = _settings(host=host, port=port, workers=workers, data_dir=data_dir)
+    logs.configure(settings, "supervisor")
     address = f"http://{settings.host}:{settings.port}"
     try:
         with _migrating():
