@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -37,7 +37,7 @@ class DispatcherMetrics:
         self.generation = self._gauge("dispatcher_generation", "Generation that this process leads as, 0 on standby")
         self.in_flight = self._gauge("runs_in_flight", "Runs that Dask has been given and that have not ended")
         self.worker_threads = self._gauge("worker_threads", "Worker threads that are connected")
-        self.workers_lost = self._counter("workers_lost", "Worker processes that went away, whatever the reason")
+        self.worker_deaths = self._counter("worker_deaths", "Worker processes that died while they had a run")
         self.claimed = self._counter("runs_claimed", "Runs taken from the queue")
         self.ended = self._counter("runs_ended", "Runs that ended for good, by their state", "state")
         self.requeued = self._counter("runs_requeued", "Attempts that gave the run back, by their outcome", "reason")
@@ -108,33 +108,49 @@ class MeasuredQueue(RunQueue):
         self._metrics.claimed.inc(len(leases))
         return leases
 
-    def store(self, lease: Lease, payload: ResultPayload) -> Stored:
+    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
         """As the queue's."""
         with self._metrics.transaction("store"):
-            stored = super().store(lease, payload)
-        if stored is Stored.STORED:
-            self._metrics.ended.labels(RunState.DONE).inc()
-            self._metrics.run_duration.observe(payload.wall_s)
-            _LOG.info("stored", extra={**logs.fields_of(lease), "wall_s": round(payload.wall_s, 3)})
-        else:
-            self._metrics.stale.labels("same" if stored is Stored.STALE_SAME else "other").inc()
-        return stored
+            outcomes = super().store_all(results)
+        for (lease, payload), stored in zip(results, outcomes, strict=True):
+            if stored is Stored.STORED:
+                self._metrics.ended.labels(RunState.DONE).inc()
+                self._metrics.run_duration.observe(payload.wall_s)
+                _LOG.info("stored", extra={**logs.fields_of(lease), "wall_s": round(payload.wall_s, 3)})
+            else:
+                self._metrics.stale.labels("same" if stored is Stored.STALE_SAME else "other").inc()
+        return outcomes
 
     def fail(self, lease: Lease, failure: Failure) -> RunState | None:
         """As the queue's."""
         with self._metrics.transaction("fail"):
             state = super().fail(lease, failure)
-        if state is RunState.QUEUED:
+        if state in {RunState.QUEUED, RunState.PAUSED}:
             self._metrics.requeued.labels(failure.outcome).inc()
         elif state is not None:
             self._metrics.ended.labels(state).inc()
         return state
 
-    def hand_back(self, *arguments: Any, **options: Any) -> int:
+    def hand_back(self, leases: Sequence[Lease], outcome: Outcome = Outcome.HANDED_BACK) -> int:
         """As the queue's."""
-        runs = super().hand_back(*arguments, **options)
-        self._metrics.requeued.labels(Outcome.HANDED_BACK).inc(runs)
+        with self._metrics.transaction("requeue"):
+            runs = super().hand_back(leases, outcome)
+        self._metrics.requeued.labels(outcome).inc(runs)
         return runs
+
+    def suspect(self, leases: Sequence[Lease], detail: str) -> int:
+        """As the queue's."""
+        with self._metrics.transaction("requeue"):
+            runs = super().suspect(leases, detail)
+        self._metrics.requeued.labels(Outcome.SUSPECTED).inc(runs)
+        return runs
+
+    def refuse_engine(self, lease: Lease, engine: str) -> bool:
+        """As the queue's."""
+        with self._metrics.transaction("requeue"):
+            moved = super().refuse_engine(lease, engine)
+        self._metrics.requeued.labels(Outcome.OTHER_ENGINE).inc(moved)
+        return moved
 
     def requeue_lost(self, lease: Lease, outcome: Outcome, detail: str) -> bool:
         """As the queue's."""
