@@ -21,6 +21,7 @@ from service.settings import LogSettings
 if TYPE_CHECKING:
     from service.store.leases import Lease
 
+Fields = dict[str, str | int]
 _ACCESS = "uvicorn.access"
 _PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 # They come with handlers of their own, or may get them when they are imported.
@@ -46,7 +47,7 @@ def configure(settings: LogSettings, process: str) -> None:
     sys.excepthook = _log_uncaught
 
 
-def fields_of(lease: Lease) -> dict[str, str | int]:
+def fields_of(lease: Lease) -> Fields:
     """What a line about a run carries: its grid, its own name, the attempt and the dispatcher's generation."""
     return {
         "grid": lease.grid_id,
@@ -59,11 +60,6 @@ def fields_of(lease: Lease) -> dict[str, str | int]:
 def bound(**fields: str | int) -> AbstractContextManager[None]:
     """Put these fields on every line that this thread or request writes while the context lasts."""
     return structlog.contextvars.bound_contextvars(**fields)
-
-
-def about(lease: Lease) -> AbstractContextManager[None]:
-    """Put a run's fields on every line while the context lasts."""
-    return bound(**fields_of(lease))
 
 
 def bind(**fields: str | int) -> None:
