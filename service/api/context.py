@@ -12,6 +12,7 @@ from service.artefacts import ArtefactStore
 from service.identifiers import GRID_PATTERN, RUN_PATTERN
 from service.settings import Settings
 from service.store.database import Database
+from service.store.events import EventStore
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 
@@ -25,6 +26,7 @@ class Context:
         self.settings = settings
         self.database = Database(settings.database)
         self.grids = GridStore(self.database)
+        self.events = EventStore(self.database)
         self.leadership = Leadership(self.database, settings.leader_ttl_s)
         self.metrics = ApiMetrics(self.database)
         self.artefacts = ArtefactStore(settings.artefacts)
