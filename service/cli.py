@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -78,14 +80,15 @@ def serve(
     data_dir: Annotated[Path | None, typer.Option(help="Folder of database and artefacts")] = None,
 ) -> None:
     """Run the service (API, dispatcher, workers) until Ctrl-C."""
-    from service.supervisor import serve as supervise  # noqa: PLC0415 - alembic takes a while, and status needs none
+    from service import logs  # noqa: PLC0415 - alembic takes a while, and status needs none
+    from service.supervisor import serve as supervise  # noqa: PLC0415 - as above
 
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
-    logging.getLogger("alembic").setLevel(logging.WARNING)
     settings = _settings(host=host, port=port, workers=workers, data_dir=data_dir)
+    logs.configure(settings, "supervisor")
     address = f"http://{settings.host}:{settings.port}"
     try:
-        supervise(settings, lambda: _console().print(f"hostlens serves {address}; Ctrl-C ends it", highlight=False))
+        with _migrating():
+            supervise(settings, lambda: _console().print(f"hostlens serves {address}; Ctrl-C ends it", highlight=False))
     except OSError as error:
         _fail(f"cannot serve {address}: {error}")
 
@@ -233,14 +236,69 @@ def drill(
 
 
 @database.command("upgrade")
-def db_upgrade() -> None:
-    """Bring the database to the newest schema."""
-    from service.store.migrate import upgrade  # noqa: PLC0415 - alembic takes a while, and status needs none
+def db_upgrade(revision: Annotated[str, typer.Argument(help="Which; the newest without")] = "head") -> None:
+    """Bring the database to a newer schema, by default the newest; may be repeated, by several at once."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
     settings = _settings()
     settings.make_folders()
-    upgrade(settings.database)
-    typer.echo("the database is up to date")
+    with _migrating():
+        migrate.upgrade(settings.database, revision)
+    typer.echo(f"the database is at revision {migrate.current(settings.database)}")
+
+
+@database.command("downgrade")
+def db_downgrade(
+    revision: Annotated[str, typer.Argument(help="Which, or base: no tables at all")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask")] = False,
+) -> None:
+    """Take the database back to an older schema; what only the newer one has is lost. Stop the service first."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    settings = _settings()
+    if not yes:
+        typer.confirm(f"take the database back to revision {revision}?", abort=True)
+    with _migrating():
+        migrate.downgrade(settings.database, revision)
+    typer.echo(f"the database is at revision {migrate.current(settings.database) or 'base'}")
+
+
+@database.command("current")
+def db_current() -> None:
+    """Revision of the database, and the one that this hostlens expects."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    with _migrating():
+        found = migrate.current(_settings().database)
+    typer.echo(f"database {found or 'base'}, code {migrate.revisions()[-1]}")
+
+
+@database.command("check")
+def db_check() -> None:
+    """Whether the database is what this hostlens expects; exit code 1 where it is not."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    with _migrating():
+        found = migrate.differences(_settings().database)
+    if found is not None:
+        _fail(found)
+    typer.echo("the database is what the code expects")
+
+
+@contextmanager
+def _migrating() -> Iterator[None]:
+    """Where a refusal of the database or of a migration ends the command with a line instead of a traceback."""
+    from sqlalchemy.exc import DBAPIError  # noqa: PLC0415 - as alembic
+
+    from service.store.migrate import MigrationError  # noqa: PLC0415 - as above
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    try:
+        yield
+    except MigrationError as error:
+        _fail(str(error))
+    except DBAPIError as error:
+        _fail(f"the database refuses: {error.orig}")
 
 
 def _watch(client: Client, grid_id: str) -> None:

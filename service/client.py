@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import httpx
 
-from service.schemas import GridPage, GridView, Readiness, RunDetail, RunPage, RunView, Summary
+from service.schemas import EventPage, GridPage, GridView, Readiness, RunDetail, RunPage, RunView, Summary
 
 _TIMEOUT_S = 60.0
 
@@ -88,6 +88,11 @@ class Client:
     def summary(self, grid_id: str) -> Summary:
         """Biases of a grid (the first thousand inputs)."""
         return Summary.model_validate(self._call("GET", f"/v1/grids/{grid_id}/summary", params={"limit": 1000}))
+
+    def events(self, grid_id: str, after: int = 0, wait_s: float = 0.0) -> EventPage:
+        """Events after number ``after``, oldest first; waits up to ``wait_s`` (30 at most) where there is none yet."""
+        params = {"cursor": after, "wait": wait_s, "limit": 1000}
+        return EventPage.model_validate(self._call("GET", f"/v1/grids/{grid_id}/events", params=params))
 
     def cancel(self, grid_id: str) -> GridView:
         """Cancel a grid."""

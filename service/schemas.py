@@ -193,6 +193,29 @@ class ResultView(_Answer):
     products: str | None
 
 
+class EventView(_Answer):
+    """Something that happened to a grid; ``detail`` depends on the kind."""
+
+    id: int
+    """Grows from event to event."""
+    grid_id: str
+    run_id: str | None
+    kind: str
+    detail: dict[str, Any]
+    created_at: datetime
+
+
+class EventPage(_Answer):
+    """Events of a grid, oldest first."""
+
+    items: list[EventView]
+    cursor: int
+    """Number of the last event up to here: with it as ``cursor`` the next answer goes on from here."""
+    ended: bool
+    """The grid has ended: nothing more comes, unless it is tried again."""
+    next: str | None
+
+
 class AttemptView(_Answer):
     """One execution of a run, after it ended."""
 

@@ -5,17 +5,30 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 Seconds = Annotated[float, Field(gt=0.0, le=7 * 86400.0, allow_inf_nan=False)]
 ClusterKind = Literal["local", "address", "slurm", "kubernetes"]
+LogLevel = Annotated[
+    Literal["DEBUG", "INFO", "WARNING", "ERROR"],
+    BeforeValidator(lambda level: level.upper() if isinstance(level, str) else level),
+]
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 _CLOSE_S = 8.0
 """What a dispatcher needs to hand runs back and to end its workers."""
 
 
-class Settings(BaseSettings):
+class LogSettings(BaseSettings):
+    """How a process logs: all that a worker or a scheduler of Dask needs to know."""
+
+    model_config = SettingsConfigDict(env_prefix="HOSTLENS_", extra="ignore")
+
+    log_format: Literal["text", "json"] = "text"
+    log_level: LogLevel = "INFO"
+
+
+class Settings(LogSettings):
     """Settings of all processes; each reads the same environment, so that API and dispatcher cannot disagree.
 
     Raises
@@ -23,8 +36,6 @@ class Settings(BaseSettings):
     pydantic.ValidationError
         Names the variable that is not acceptable.
     """
-
-    model_config = SettingsConfigDict(env_prefix="HOSTLENS_", extra="ignore")
 
     data_dir: Path = Path("var/hostlens")
     """Where the embedded database, the artefacts and Dask's scratch files lie unless said otherwise."""
@@ -79,6 +90,10 @@ class Settings(BaseSettings):
     """A worker older than this is started anew once it is idle, each at its own time within a fifth of it."""
     worker_ttl_s: Annotated[float, Field(ge=10.0, le=86400.0)] = 60.0
     """A local worker that says nothing for so long is started anew."""
+
+    metrics_host: str = "127.0.0.1"
+    metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """Where the dispatcher shows its metrics; nowhere where None. The API shows its own on its own port."""
 
     heartbeat_s: Seconds = 5.0
     leader_ttl_s: Seconds = 30.0

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from service import logs
 from service.artefacts import ArtefactStore
 from service.payload import ArtefactPayload, result_payload
 
@@ -30,13 +31,20 @@ _FIRST_COLD = "parametric"
 """Stage of the engine before which a warm-up ends: nearly all that is slow the first time is in the one before."""
 
 
-def call_tasks(task: str, specs: Sequence[dict[str, Any]], artefact_url: str) -> list[dict[str, Any]]:
+def call_tasks(
+    task: str, specs: Sequence[dict[str, Any]], artefact_url: str, fields: Sequence[logs.Fields] = ()
+) -> list[dict[str, Any]]:
     """Run the task for one specification after the other; their answers in the same order.
 
     The dispatcher submits this function, so that it need not import the engine itself. Short runs come several at a
-    time: what Dask does for each task would take longer than they do.
+    time: what Dask does for each task would take longer than they do. ``fields``, if given, has for each specification
+    what goes on every line that is logged meanwhile.
     """
-    return [call_task(task, spec, artefact_url) for spec in specs]
+    answers = []
+    for place, spec in enumerate(specs):
+        with logs.bound(**(fields[place] if fields else {})):
+            answers.append(call_task(task, spec, artefact_url))
+    return answers
 
 
 def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
@@ -49,7 +57,7 @@ def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, A
         payload = getattr(import_module(module), name)(spec, artefact_url)
         return {"payload": payload, "engine": _engine()}
     except Exception as error:  # noqa: BLE001 - whatever went wrong must go home as data; the dispatcher decides
-        _LOG.warning("run failed on the worker:\n%s", traceback.format_exc())
+        _LOG.warning("the run failed on the worker", exc_info=error)
         return {
             "error": {
                 "code": _error_code(error),

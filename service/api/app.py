@@ -9,9 +9,10 @@ from typing import Any
 from fastapi import Depends, FastAPI
 
 from service import VERSION
-from service.api import catalogue, grids, health, problems
-from service.api.context import Context
+from service.api import catalogue, events, grids, health, problems
+from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
+from service.api.metrics import Measured
 from service.schemas import Problem
 from service.settings import Settings
 
@@ -60,12 +61,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
         lifespan=lifespan,
-        dependencies=[Depends(known_parameters)],
+        dependencies=[Depends(known_parameters), Depends(bind_ids)],
         redirect_slashes=False,
     )
     app.state.context = context
     app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes)
+    # Last added is outermost: refused bodies are requests too.
+    app.add_middleware(Measured, metrics=context.metrics)
     problems.install(app)
-    for room in (grids, catalogue, health):
+    for room in (grids, events, catalogue, health):
         app.include_router(room.router)
     return app

@@ -6,12 +6,17 @@ from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
 
+from service import logs
+from service.api.metrics import ApiMetrics
 from service.artefacts import ArtefactStore
 from service.identifiers import GRID_PATTERN, RUN_PATTERN
 from service.settings import Settings
 from service.store.database import Database
+from service.store.events import EventStore
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
+
+_IDS = frozenset({"grid_id", "run_id"})
 
 
 class Context:
@@ -21,7 +26,9 @@ class Context:
         self.settings = settings
         self.database = Database(settings.database)
         self.grids = GridStore(self.database)
+        self.events = EventStore(self.database)
         self.leadership = Leadership(self.database, settings.leader_ttl_s)
+        self.metrics = ApiMetrics(self.database)
         self.artefacts = ArtefactStore(settings.artefacts)
 
 
@@ -36,3 +43,11 @@ Service = Annotated[Context, Depends(_context)]
 GridId = Annotated[str, Path(pattern=GRID_PATTERN, description="A grid's identifier")]
 RunId = Annotated[str, Path(pattern=RUN_PATTERN, description="A run's identifier")]
 Limit = Annotated[int, Query(ge=1, le=1000, description="Items on a page")]
+
+
+async def bind_ids(request: Request) -> None:
+    """Put the grid or run that a request names on every line that is logged for it.
+
+    Not a plain function: what one of those binds stays in the thread that it runs on.
+    """
+    logs.bind(**{name.removesuffix("_id"): value for name, value in request.path_params.items() if name in _IDS})

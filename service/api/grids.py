@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -18,6 +19,7 @@ from service.store.states import RunState
 from service.store.summary import summarise
 
 router = APIRouter(prefix="/v1", tags=["grids"])
+_LOG = logging.getLogger(__name__)
 IdempotencyKey = Annotated[
     str | None,
     Header(min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description="Same key, same grid"),
@@ -47,6 +49,7 @@ def submit(
         idempotency_key,
         engine_digest(),
     )
+    _LOG.info("replayed" if made.replayed else "accepted", extra={"grid": made.grid.id, "runs": made.grid.n_runs})
     headers = {"Location": made.grid.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
     return JSONResponse(made.grid.model_dump(mode="json"), status_code=202, headers=headers)
 

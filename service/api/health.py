@@ -1,13 +1,15 @@
-"""/healthz and /readyz: whether the process answers, and whether what it accepts is carried out."""
+"""/healthz, /readyz, /metrics: whether the process answers, whether what it accepts is carried out, and how much."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Response
+from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.api.context import Service
 from service.schemas import Health, Readiness
 
 router = APIRouter(tags=["health"])
+_TEXT = {200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "Prometheus text format"}}
 
 
 @router.get("/healthz")
@@ -28,3 +30,9 @@ def readyz(service: Service) -> Readiness:
         engines={} if leader is None else leader.engines,
         beat_at=None if leader is None else leader.beat_at,
     )
+
+
+@router.get("/metrics", response_class=Response, responses=_TEXT)  # type: ignore[arg-type]
+def metrics(service: Service) -> Response:
+    """Metrics of this process and of the queue, for Prometheus."""
+    return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)

@@ -36,6 +36,8 @@ def dask_config(settings: Settings) -> dict[str, Any]:
         # Dask pins all of these but NUMBA_NUM_THREADS by itself.
         "distributed.nanny.pre-spawn-environ": ONE_THREAD,
         "distributed.worker.daemon": True,
+        # Workers write the lines that the service writes, with the run on them.
+        "distributed.worker.preload": ["service.logs"],
         "distributed.comm.timeouts.connect": "10s",
         # Dask looks at itself fifty times a second in each process, for a dashboard that nobody sees; on two cores
         # this took 7 % of one from the engine.

@@ -8,6 +8,7 @@ import time
 
 from sqlalchemy.exc import DBAPIError
 
+from service import logs
 from service.settings import Settings
 from service.store.database import Database
 from service.store.leadership import Leadership
@@ -39,6 +40,7 @@ class Heartbeat:
         self._thread.join(timeout=self._settings.leader_ttl_s)
 
     def _beat(self) -> None:
+        logs.bind(generation=self._generation)
         database = Database(self._settings.database, pooled=False)
         leadership = Leadership(database, self._settings.leader_ttl_s)
         told: dict[str, int] | None = None

@@ -17,9 +17,11 @@ from typing import Any
 from distributed import KilledWorker
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
+from service import logs
 from service.dispatcher.attribution import Deaths
 from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, unstorable, worker_lost
 from service.dispatcher.heartbeat import Heartbeat
+from service.dispatcher.metrics import DispatcherMetrics
 from service.dispatcher.placement import Slots
 from service.dispatcher.pool import Pool, Worker, is_lost
 from service.payload import ResultPayload
@@ -57,7 +59,14 @@ class Dispatcher:
     is claimed, and no result is dropped because the database was away.
     """
 
-    def __init__(self, settings: Settings, queue: RunQueue, heartbeat: Heartbeat, generation: int) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        queue: RunQueue,
+        heartbeat: Heartbeat,
+        generation: int,
+        metrics: DispatcherMetrics | None = None,
+    ) -> None:
         self._settings = settings
         self._queue = queue
         self._heartbeat = heartbeat
@@ -73,6 +82,9 @@ class Dispatcher:
         self._back_off = 0.0
         self._empty_looks = 0
         self._due: dict[str, float] = {}
+        self._metrics = metrics or DispatcherMetrics()
+        self._metrics.in_flight.set_function(lambda: len(self._flights))
+        self._metrics.worker_threads.set_function(lambda: sum(self._heartbeat.engines.values()))
 
     def run(self, pool: Pool, stop: Event) -> None:
         """Dispatch until ``stop`` is set, the leadership is lost or the scheduler is gone.
@@ -88,7 +100,8 @@ class Dispatcher:
             if not pool.running:
                 _LOG.error("the scheduler is gone")
                 return
-            self._guarded(self._step, stop.wait)
+            with self._metrics.loops.time():
+                self._guarded(self._step, stop.wait)
 
     def drain(self) -> None:
         """Claim nothing more, and wait a little for what is about to end; a run that takes longer is handed back."""
@@ -239,10 +252,12 @@ class Dispatcher:
         except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
             ending = read_exception(error)
         if isinstance(ending, Failure):
-            _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, ending.detail)
+            told = {**logs.fields_of(lease), "code": ending.code}
+            _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, ending.detail, extra=told)
             self._endings.append(partial(self._queue.fail, lease, ending))
         elif isinstance(ending, OtherEngine):
-            _LOG.warning("run %s, attempt %d: engine %s", lease.run_id, lease.attempt, ending.digest)
+            told = logs.fields_of(lease)
+            _LOG.warning("run %s, attempt %d: engine %s", lease.run_id, lease.attempt, ending.digest, extra=told)
             self._endings.append(partial(self._queue.refuse_engine, lease, ending.digest))
         else:
             results.append((lease, ending))
@@ -257,12 +272,13 @@ class Dispatcher:
                 # Nothing was stored; each is tried alone, so that one that is refused keeps no other out.
                 self._endings.extend(partial(self._store, [one]) for one in results)
                 return
-            _LOG.exception("run %s cannot be stored", results[0][0].run_id)
+            _LOG.exception("run %s cannot be stored", results[0][0].run_id, extra=logs.fields_of(results[0][0]))
             self._queue.fail(results[0][0], unstorable(error))
             return
         for (lease, _), outcome in zip(results, stored, strict=True):
             if outcome is not Stored.STORED:
-                _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, outcome)
+                told = logs.fields_of(lease)
+                _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, outcome, extra=told)
 
     def _write_endings(self) -> None:
         while self._endings:
@@ -276,6 +292,7 @@ class Dispatcher:
         if self._pool.was_stopped(address) or self._pool.closed_on_purpose(address):
             self._lose(flights, "the worker was stopped")
             return
+        self._metrics.worker_deaths.inc()
         _LOG.warning("worker %s died with %d runs", address, len(flights))
         self._deaths.add(flights, time.monotonic())
 
@@ -308,7 +325,9 @@ class Dispatcher:
     def _lose(self, flights: Iterable[Flight], detail: str) -> None:
         """Runs that are not to blame go back uncharged."""
         for flight in flights:
-            _LOG.info("run %s, attempt %d goes back: %s", flight.lease.run_id, flight.lease.attempt, detail)
+            lease = flight.lease
+            told = logs.fields_of(lease)
+            _LOG.info("run %s, attempt %d goes back: %s", lease.run_id, lease.attempt, detail, extra=told)
             self._endings.append(partial(self._queue.requeue_lost, flight.lease, Outcome.FORGOTTEN, detail))
 
     def _stop_cancelled(self) -> None:

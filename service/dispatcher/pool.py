@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 from uuid import uuid4
 
+from service import logs
 from service.dispatcher.clusters import open_client
 from service.settings import Settings
 from service.store.leases import Lease
@@ -73,7 +74,8 @@ class Pool:
     def submit(self, leases: Sequence[Lease], worker: Worker) -> Any:
         """Start runs, one after the other as one task; the future of their answers, in the same order."""
         specs = [lease.spec for lease in leases]
-        return self._on(worker.address, leases[0].key, call_tasks, specs, self._settings.artefacts)
+        fields = [logs.fields_of(lease) for lease in leases]
+        return self._on(worker.address, leases[0].key, call_tasks, specs, self._settings.artefacts, fields)
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""

@@ -11,16 +11,17 @@ from types import FrameType
 
 from sqlalchemy.exc import DBAPIError
 
+from service import logs
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.holder import is_dead, own_name
 from service.dispatcher.loop import Dispatcher
+from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
 from service.dispatcher.pool import Pool, open_pool
 from service.process import stop_with_parent
 from service.settings import Settings
 from service.store.database import Database
 from service.store.leadership import Leadership, LeadershipLostError
 from service.store.leases import Outcome
-from service.store.queue import RunQueue
 
 _LOG = logging.getLogger(__name__)
 STOPPED, ENDED = 0, 75
@@ -30,7 +31,7 @@ _FIRST_DELAY_S, _MAX_DELAY_S, _STEADY_S = 0.5, 30.0, 30.0
 
 def dispatch(settings: Settings) -> int:
     """Dispatch until SIGINT or SIGTERM, or until this process no longer can; the exit code says which."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
+    logs.configure(settings, "dispatcher")
     # Dask says at INFO and WARNING what is normal here: workers that come and go with us.
     logging.getLogger("distributed").setLevel(logging.ERROR)
     stop = Event()
@@ -42,13 +43,20 @@ def dispatch(settings: Settings) -> int:
     signal.signal(signal.SIGINT, on_signal)
     stop_with_parent()
     settings.make_folders()
+    metrics = DispatcherMetrics()
+    with metrics.serving(settings):
+        return _dispatch(settings, metrics, stop)
+
+
+def _dispatch(settings: Settings, metrics: DispatcherMetrics, stop: Event) -> int:
     database = Database(settings.database)
     leadership = Leadership(database, settings.leader_ttl_s)
     try:
         generation = wait_to_lead(leadership, settings, stop)
         if generation is None:
             return STOPPED
-        _lead(settings, database, generation, stop)
+        with logs.bound(generation=generation):
+            _lead(settings, database, generation, metrics, stop)
         with suppress(DBAPIError):  # without it the row runs out by itself
             leadership.resign(generation)
     finally:
@@ -72,12 +80,13 @@ def wait_to_lead(leadership: Leadership, settings: Settings, stop: Event) -> int
     return None
 
 
-def _lead(settings: Settings, database: Database, generation: int, stop: Event) -> None:
+def _lead(settings: Settings, database: Database, generation: int, metrics: DispatcherMetrics, stop: Event) -> None:
     """Dispatch on one pool of workers after another, until stopped or deposed."""
+    metrics.generation.set(generation)
     heartbeat = Heartbeat(settings, generation)
     heartbeat.start()
-    queue = RunQueue(database, retry_delay_s=settings.retry_delay_s)
-    dispatcher = Dispatcher(settings, queue, heartbeat, generation)
+    queue = MeasuredQueue(metrics, database, retry_delay_s=settings.retry_delay_s)
+    dispatcher = Dispatcher(settings, queue, heartbeat, generation, metrics)
     delay = _FIRST_DELAY_S
     try:
         while not (stop.is_set() or heartbeat.lost.is_set()):

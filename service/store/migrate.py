@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
 from pathlib import Path
 
 from alembic import command
 from alembic.config import Config
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from alembic.util.exc import CommandError
+from sqlalchemy import Connection, text
 
 from service.store.database import Database
+
+# Any number that no other program on the same database takes for its own advisory lock.
+_LOCK = 4_650_048_421
+
+
+class MigrationError(RuntimeError):
+    """The schema cannot be brought to where it was asked to be; nothing has been changed."""
 
 
 def migrations_folder() -> Path:
@@ -20,40 +32,79 @@ def migrations_folder() -> Path:
     raise FileNotFoundError(f"no migrations beside {package}")
 
 
-def upgrade(url: str, revision: str = "head") -> None:
-    """Bring the database to ``revision``: idempotent; an empty database gets all tables."""
-    _run(url, lambda config: command.upgrade(config, revision))
+def revisions(folder: Path | None = None) -> tuple[str, ...]:
+    """Every revision of the tree, oldest first; the last is the one that the code expects."""
+    walked = ScriptDirectory.from_config(_config(folder)).walk_revisions()
+    return tuple(reversed([script.revision for script in walked]))
 
 
-def downgrade(url: str, revision: str) -> None:
-    """Take the database back to ``revision`` (``base`` drops all tables and what is in them)."""
-    _run(url, lambda config: command.downgrade(config, revision))
+def current(url: str) -> str | None:
+    """The revision that a database is at, None for one without tables; also one that this code does not know."""
+    database = Database(url, pooled=False)
+    try:
+        with database.read() as connection:
+            return MigrationContext.configure(connection).get_current_revision()
+    finally:
+        database.close()
+
+
+def upgrade(url: str, revision: str = "head", folder: Path | None = None) -> None:
+    """Bring the database to ``revision``: idempotent; an empty database gets all tables.
+
+    One transaction, and one process at a time: every process of an installation may do this when it starts.
+
+    Raises
+    ------
+    MigrationError
+        A migration does not know the revision, or would leave rows that refer to nothing.
+    """
+    _run(url, lambda config: command.upgrade(config, revision), folder)
+
+
+def downgrade(url: str, revision: str, folder: Path | None = None) -> None:
+    """Take the database back to ``revision`` (``base`` drops all tables and what is in them); as :func:`upgrade`."""
+    _run(url, lambda config: command.downgrade(config, revision), folder)
 
 
 def differences(url: str) -> str | None:
     """What ``alembic check`` finds between the migrated database and the tables in the code; None where they agree."""
     try:
         _run(url, command.check)
-    except CommandError as error:
+    except MigrationError as error:
         return str(error)
     return None
 
 
-def _run(url: str, action: object) -> None:
-    if not callable(action):
-        raise TypeError(type(action))
-    config = Config()
-    config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
-    # Without foreign keys, or SQLite would see a table that a migration copies as the loss of all that refers to it.
+def _config(folder: Path | None) -> Config:
+    config = Config(stdout=io.StringIO())
+    config.set_main_option("script_location", str(folder or migrations_folder()).replace("%", "%%"))
+    return config
+
+
+def _run(url: str, action: Callable[[Config], object], folder: Path | None = None) -> None:
+    config = _config(folder)
+    # Without foreign keys, or SQLite would see a table that a migration copies as the loss of all that refers to it;
+    # the check before the commit makes up for them.
     database = Database(url, pooled=False, foreign_keys=False)
     try:
         # The service's own connection, so that migrations run under the same settings as everything else.
         with database.write() as connection:
+            if not database.is_sqlite:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _LOCK})
             config.attributes["connection"] = connection
+            before = MigrationContext.configure(connection).get_current_revision()
             action(config)
-            if database.is_sqlite:
-                broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
-                if broken:
-                    raise RuntimeError(f"the migration would leave rows that refer to nothing: {broken[:5]}")
+            moved = MigrationContext.configure(connection).get_current_revision() != before
+            if moved and database.is_sqlite:
+                _require_references(connection)
+    except CommandError as error:
+        raise MigrationError(str(error)) from error
     finally:
         database.close()
+
+
+def _require_references(connection: Connection) -> None:
+    broken = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
+    if broken:
+        table, _, other, _ = broken[0]
+        raise MigrationError(f"{len(broken)} rows would refer to nothing, the first in {table} to {other}")

@@ -76,6 +76,7 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
             "self": f"/v1/grids/{row.id}",
             "runs": f"/v1/grids/{row.id}/runs",
             "summary": f"/v1/grids/{row.id}/summary",
+            "events": f"/v1/grids/{row.id}/events",
             **{action: f"/v1/grids/{row.id}/{action}" for action in ("cancel", "pause", "resume", "retry")},
         },
     )

@@ -1,58 +1,317 @@
-"""One tree of migrations makes the tables of the code, on both databases, up and down and up again."""
+"""One tree of migrations makes the tables of the code, on both databases, from every revision, and keeps the rows."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
-from sqlalchemy import inspect
+from sqlalchemy import Connection, inspect
+from typer.testing import CliRunner
 
+from service.cli import app
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
-from service.store.migrate import differences, downgrade, upgrade
+from service.store.migrate import (
+    MigrationError,
+    current,
+    differences,
+    downgrade,
+    migrations_folder,
+    revisions,
+    upgrade,
+)
 from service.store.queue import RunQueue, Stored
+from service.store.summary import summarise
 from service.store.tables import metadata
+from tests.service import history
 from tests.service.conftest import new_database
 from tests.service.plans import result_of, submit
+from tests.service.service_process import ROOT
 
 
 @pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
-def empty_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'new.sqlite'}"
-    return new_database(request.getfixturevalue("postgres_server"), f"new_{tmp_path.name}")
+def backend(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
-def test_migrated_databases_are_what_the_code_expects(empty_url: str) -> None:
-    assert differences(empty_url) is not None
-    upgrade(empty_url)
-    assert differences(empty_url) is None
-    upgrade(empty_url)
-    database = Database(empty_url)
+class Empties:
+    """Empty databases of one kind, as many as a test wants."""
+
+    def __init__(self, backend: str, folder: Path, server: str | None) -> None:
+        self._backend, self._folder, self._server = backend, folder, server
+        self._made = 0
+
+    def __call__(self) -> str:
+        self._made += 1
+        if self._server is None:
+            return f"sqlite:///{self._folder / f'{self._made}.sqlite'}"
+        return new_database(self._server, f"migrations_{self._folder.name}_{self._made}")
+
+
+@pytest.fixture
+def empties(backend: str, request: pytest.FixtureRequest, tmp_path: Path) -> Empties:
+    return Empties(backend, tmp_path, request.getfixturevalue("postgres_server") if backend == "postgresql" else None)
+
+
+@pytest.fixture
+def lived(empties: Empties) -> history.Rows:
+    """What a service of today leaves in its database."""
+    url = empties()
+    upgrade(url)
+    database = Database(url, pooled=False)
+    history.live(database)
+    with database.read() as connection:
+        return history.typed(connection)
+
+
+def test_the_tree_is_one_line() -> None:
+    found = revisions()
+    assert len(found) == len(set(found)) >= 1
+
+
+@pytest.mark.parametrize("revision", revisions())
+def test_rows_of_every_revision_outlive_the_upgrade_the_downgrade_and_the_next_upgrade(
+    revision: str, empties: Empties, lived: history.Rows
+) -> None:
+    url = empties()
+    upgrade(url, revision)
+    assert current(url) == revision
+    database = Database(url, pooled=False)
+    with database.write() as connection:
+        history.write(connection, lived)
+    with database.read() as connection:
+        before = history.read(connection)
+    assert all(before.values()), f"a table without rows: {before.keys()}"
+
+    upgrade(url)
+    assert differences(url) is None
+    _assert_kept(database, before)
+    _assert_readable(database, lived)
+    _assert_working(database)
+
+    with database.read() as connection:
+        newest = history.read(connection)
+    downgrade(url, revision)
+    _assert_kept(database, {name: rows for name, rows in newest.items() if name in before})
+    upgrade(url)
+    assert differences(url) is None
+    _assert_kept(database, {name: rows for name, rows in newest.items() if name in before}, before)
+
+
+def _assert_kept(database: Database, before: history.Rows, columns_of: history.Rows | None = None) -> None:
+    """Each row is there, the same in every column that both revisions have."""
+    with database.read() as connection:
+        after = history.read(connection)
+    for name, rows in before.items():
+        if name not in after:
+            continue
+        shared = set(rows[0]) & set(after[name][0]) & set((columns_of or before)[name][0])
+        assert shared, name
+        assert _cut(after[name], shared) == _cut(rows, shared), name
+
+
+def _cut(rows: list[dict[str, Any]], columns: set[str]) -> list[dict[str, Any]]:
+    return [{column: row[column] for column in sorted(columns)} for row in rows]
+
+
+def _assert_readable(database: Database, lived: history.Rows) -> None:
     grids = GridStore(database)
+    found = grids.grids(100).items
+    assert {grid.id for grid in found} == {row["id"] for row in lived["grid"]}
+    assert sorted(grid.state for grid in found) == ["cancelled", "done", "failed", "queued", "running"]
+    stored = 0
+    for grid in found:
+        for run in grids.runs(grid.id, 100).items:
+            detail = grids.run(run.id)
+            stored += detail.result is not None
+            assert (detail.result is not None) == (detail.state == "done")
+        assert summarise(database, grid, 100).n_runs == grid.n_runs
+    assert stored == len(lived["result"]) == 3
+
+
+def _assert_working(database: Database) -> None:
+    """The queue goes on where it stood: the one leased run comes back to it, and can be stored."""
+    generation = Leadership(database).take("there|2|2.00", lambda _: True)
+    assert generation == 2
+    queue = RunQueue(database)
+    leases = queue.claim(generation, 100)
+    assert leases
+    assert queue.store(leases[0], result_of(leases[0])) is Stored.STORED
+    queue.hand_back(leases[1:])
+
+
+def test_migrated_tables_are_the_code_s_to_the_last_constraint(empties: Empties) -> None:
+    # alembic check compares neither check constraints nor the conditions of partial indices.
+    migrated, created = empties(), empties()
+    assert differences(migrated) is not None
+    upgrade(migrated)
+    assert differences(migrated) is None
+    database = Database(created, pooled=False)
+    with database.write() as connection:
+        metadata.create_all(connection)
+        wanted = _described(connection)
+    with Database(migrated, pooled=False).read() as connection:
+        found = _described(connection)
+    for table, description in wanted.items():
+        assert found[table] == description
+    assert set(found) == set(wanted)
+
+
+def _described(connection: Connection) -> dict[str, Any]:
+    look = inspect(connection)
+    return {
+        table: {
+            "columns": {
+                column["name"]: (str(column["type"]), column["nullable"], column["default"])
+                for column in look.get_columns(table)
+            },
+            "primary key": look.get_pk_constraint(table),
+            "unique": sorted(look.get_unique_constraints(table), key=str),
+            "checks": sorted(look.get_check_constraints(table), key=str),
+            "foreign keys": sorted(look.get_foreign_keys(table), key=str),
+            "indices": sorted(
+                (index["name"], index["column_names"], bool(index["unique"]), _conditions(index))
+                for index in look.get_indexes(table)
+            ),
+        }
+        for table in look.get_table_names()
+        if table != "alembic_version"
+    }
+
+
+def _conditions(index: Any) -> str:
+    return str({name: str(value) for name, value in index.get("dialect_options", {}).items()})
+
+
+def test_base_leaves_no_table_and_can_be_upgraded_again(empties: Empties) -> None:
+    url = empties()
+    upgrade(url)
+    upgrade(url)
+    downgrade(url, "base")
+    database = Database(url, pooled=False)
+    assert set(inspect(database.engine).get_table_names()) <= {"alembic_version"}
+    database.close()
+    assert current(url) is None
+    upgrade(url)
+    assert differences(url) is None
+
+
+def test_paused_runs_wait_in_the_queue_of_a_code_that_knows_no_pause(empties: Empties) -> None:
+    url = empties()
+    upgrade(url)
+    database = Database(url, pooled=False)
+    grids, queue = GridStore(database), RunQueue(database)
     grid_id = submit(grids, 2)
-    upgrade(empty_url)
-    assert grids.grid(grid_id).n_runs == 2
-    # Down one revision and up again with runs that other tables refer to, one of them paused.
     generation = Leadership(database).take("test")
     assert generation == 1
-    queue = RunQueue(database)
     (lease,) = queue.claim(generation, 1)
     assert queue.store(lease, result_of(lease)) is Stored.STORED
     grids.pause(grid_id)
-    database.close()
-    downgrade(empty_url, "0001")
-    upgrade(empty_url)
-    assert differences(empty_url) is None
+    downgrade(url, "0001")
+    upgrade(url)
     again = grids.grid(grid_id)
     assert (again.counts.done, again.counts.queued, again.state) == (1, 1, "running")
-    assert grids.run(lease.run_id).result is not None
-    downgrade(empty_url, "base")
-    assert set(inspect(database.engine).get_table_names()) <= {"alembic_version"}
-    upgrade(empty_url)
-    assert differences(empty_url) is None
-    database.close()
+
+
+def test_processes_that_upgrade_at_once_take_turns(empties: Empties) -> None:
+    url = empties()
+    command = [sys.executable, "-c", f"from service.store.migrate import upgrade; upgrade({url!r})"]
+    started = [subprocess.Popen(command, cwd=ROOT) for _ in range(3)]
+    assert [process.wait(timeout=60) for process in started] == [0, 0, 0]
+    assert differences(url) is None
+
+
+NEXT = """
+import sqlalchemy as sa
+from alembic import op
+
+revision, down_revision, branch_labels, depends_on = "next", "{head}", None, None
+
+
+def upgrade():
+    with op.batch_alter_table("run") as table:
+        table.add_column(sa.Column("colour", sa.String(16), nullable=False, server_default="red"))
+    {more}
+
+
+def downgrade():
+    with op.batch_alter_table("run") as table:
+        table.drop_column("colour")
+"""
+
+
+def _with_next(folder: Path, more: str = "") -> Path:
+    shutil.copytree(migrations_folder(), folder)
+    text = NEXT.format(head=revisions()[-1], more=more)
+    (folder / "versions" / "next.py").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_a_table_that_others_refer_to_can_be_copied_without_losing_their_rows(
+    empties: Empties, lived: history.Rows, tmp_path: Path
+) -> None:
+    url = empties()
+    upgrade(url)
+    database = Database(url, pooled=False)
+    with database.write() as connection:
+        history.write(connection, lived)
+        before = history.read(connection)
+    folder = _with_next(tmp_path / "tree")
+    upgrade(url, folder=folder)
+    _assert_kept(database, before)
+    downgrade(url, revisions()[-1], folder)
+    with database.read() as connection:
+        assert history.read(connection) == before
+    assert differences(url) is None
+
+
+def test_a_migration_that_leaves_rows_without_their_run_changes_nothing(
+    empties: Empties, backend: str, lived: history.Rows, tmp_path: Path
+) -> None:
+    url = empties()
+    upgrade(url)
+    database = Database(url, pooled=False)
+    with database.write() as connection:
+        history.write(connection, lived)
+        before = history.read(connection)
+    folder = _with_next(tmp_path / "tree", """op.execute("delete from run where state = 'done'")""")
+    with pytest.raises(Exception, match=r"refer to nothing|violates foreign key"):
+        upgrade(url, folder=folder)
+    with database.read() as connection:
+        assert history.read(connection) == before
+    assert current(url) == revisions()[-1]
+
+
+def test_a_database_of_a_newer_hostlens_is_refused(empties: Empties, tmp_path: Path) -> None:
+    url = empties()
+    upgrade(url, folder=_with_next(tmp_path / "tree"))
+    assert current(url) == "next"
+    with pytest.raises(MigrationError, match="next"):
+        upgrade(url)
+
+
+def test_the_command_line_migrates(empties: Empties, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOSTLENS_DATABASE_URL", empties())
+    monkeypatch.setenv("HOSTLENS_DATA_DIR", str(tmp_path / "data"))
+    head = revisions()[-1]
+    run = CliRunner()
+    assert run.invoke(app, ["db", "current"]).output == f"database base, code {head}\n"
+    assert run.invoke(app, ["db", "check"]).exit_code == 1
+    assert run.invoke(app, ["db", "upgrade"]).output == f"the database is at revision {head}\n"
+    assert run.invoke(app, ["db", "current"]).output == f"database {head}, code {head}\n"
+    assert run.invoke(app, ["db", "check"]).exit_code == 0
+    assert run.invoke(app, ["db", "downgrade", "base"], input="n\n").exit_code == 1
+    assert run.invoke(app, ["db", "check"]).exit_code == 0
+    assert run.invoke(app, ["db", "downgrade", "base", "--yes"]).exit_code == 0
+    assert run.invoke(app, ["db", "current"]).output == f"database base, code {head}\n"
+    refused = run.invoke(app, ["db", "upgrade", "9999"])
+    assert refused.exit_code == 1
+    assert "9999" in refused.output
 
 
 def test_every_constraint_has_a_name_that_postgresql_keeps() -> None:

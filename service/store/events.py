@@ -1,0 +1,48 @@
+"""The outbox: what has happened to a grid, in order."""
+
+from __future__ import annotations
+
+from sqlalchemy import func, select
+
+from service.schemas import EventPage, EventView
+from service.store.database import Database
+from service.store.grids import NotFoundError
+from service.store.tables import event, grid
+
+
+class EventStore:
+    """Events of grids.
+
+    Whoever reads on from the last number that was seen misses nothing of what becomes of runs: all of that is written
+    under the lock of the grid, so numbers are committed in their order. Only a ``stale_result``, which changes
+    nothing, may come in behind.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def page(self, grid_id: str, after: int, limit: int) -> EventPage:
+        """Up to ``limit`` events with numbers above ``after``; ``next`` holds the cursor where there are more.
+
+        Raises
+        ------
+        service.store.grids.NotFoundError
+            There is no such grid.
+        """
+        wanted = select(event).where(event.c.grid_id == grid_id, event.c.id > after)
+        with self._database.read() as connection:
+            ended = connection.execute(select(grid.c.finished_at).where(grid.c.id == grid_id)).one_or_none()
+            if ended is None:
+                raise NotFoundError(f"there is no grid {grid_id}")
+            rows = connection.execute(wanted.order_by(event.c.id).limit(limit + 1)).all()
+        items = [EventView(**{name: getattr(row, name) for name in EventView.model_fields}) for row in rows[:limit]]
+        cursor = items[-1].id if items else after
+        more = len(rows) > limit
+        return EventPage(
+            items=items, cursor=cursor, ended=ended.finished_at is not None, next=str(cursor) if more else None
+        )
+
+    def latest(self, grid_id: str) -> int:
+        """Number of the newest event of a grid, 0 where there is none."""
+        with self._database.read() as connection:
+            return connection.scalar(select(func.max(event.c.id)).where(event.c.grid_id == grid_id)) or 0
