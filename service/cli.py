@@ -110,6 +110,34 @@ def dispatcher() -> None:
 
 
 @app.command()
+def scheduler(
+    host: Annotated[str, typer.Option(help="Where it listens; whoever reaches it can run code on the workers")],
+    port: Annotated[int, typer.Option(help="Port for dispatcher and workers")] = 8786,
+    health: Annotated[str, typer.Option(help="Address of /health and /metrics")] = "127.0.0.1:8787",
+) -> None:
+    """Run a Dask scheduler for workers on several machines."""
+    from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
+
+    settings = _settings()
+    settings.make_folders()
+    standalone.become(settings, standalone.scheduler_arguments(settings, host, port, health))
+
+
+@app.command()
+def worker(
+    address: Annotated[str, typer.Argument(envvar="HOSTLENS_SCHEDULER_ADDRESS", help="Of the scheduler")],
+    workers: Annotated[int, typer.Option(min=1, help="Processes, of one thread each")] = 1,
+    health: Annotated[str, typer.Option(help="Address of /health and /metrics of the first")] = "127.0.0.1:0",
+) -> None:
+    """Run workers for a scheduler, here or on another machine."""
+    from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
+
+    settings = _settings()
+    settings.make_folders()
+    standalone.become(settings, standalone.worker_arguments(settings, address, workers, health))
+
+
+@app.command()
 def demo(
     data_dir: Annotated[Path, typer.Option(help="Folder of the demo's database and figures")] = Path("var/demo"),
 ) -> None:
