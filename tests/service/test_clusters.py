@@ -28,6 +28,9 @@ from tests.service.certificates import make_certificates
 from tests.service.plans import submit
 from tests.service.service_process import ROOT, eventually, free_port
 
+# How long a step may take on a machine that has other things to do: cold kernels alone are 20 s. Nothing is claimed of it.
+_PATIENCE_S = 150
+
 
 class Apart:
     """A scheduler, workers and a dispatcher, each started by its own command as on different machines."""
@@ -131,7 +134,7 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
             view = leadership.alive()
             return view is not None and view.engines == {engine_digest(): threads}
 
-        eventually(lambda: ready(2), 60, "two greeted workers")
+        eventually(lambda: ready(2), _PATIENCE_S, "two greeted workers")
         with pytest.raises(OSError, match=r"Timed out|TLS|close|connect"):
             Client(f"tcp://127.0.0.1:{cluster.port}", timeout="2s", set_as_default=False)
         with Client(cluster.settings.scheduler_address, security=security_of(cluster.settings)) as client:
@@ -140,39 +143,39 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
                 assert threads == {1}
             assert client.run_on_scheduler(lambda dask_scheduler: dask_scheduler.allowed_failures) == 0
         first = submit(grids, 12)
-        eventually(lambda: grids.grid(first).counts.done == 12, 60, "the first grid")
+        eventually(lambda: grids.grid(first).counts.done == 12, _PATIENCE_S, "the first grid")
         assert outcomes(database) == {"done": 12}
 
         # A worker that is told to go takes nobody's good name with it.
         second = submit(grids, 60, seed=100)
-        eventually(lambda: grids.grid(second).counts.done >= 4, 60, "progress")
+        eventually(lambda: grids.grid(second).counts.done >= 4, _PATIENCE_S, "progress")
         workers[0].terminate()
-        workers[0].wait(timeout=40)
-        eventually(lambda: ready(1), 30, "one worker left")
+        workers[0].wait(timeout=_PATIENCE_S)
+        eventually(lambda: ready(1), _PATIENCE_S, "one worker left")
         assert outcomes(database)["worker_lost"] + outcomes(database)["suspected"] == 0
 
         # The scheduler dies, and with it the workers; both come back, the dispatcher was there all the time.
         scheduler.kill()
         scheduler.wait()
-        workers[1].wait(timeout=60)
-        eventually(lambda: (view := leadership.alive()) is not None and view.workers == 0, 30, "degraded")
+        workers[1].wait(timeout=_PATIENCE_S)
+        eventually(lambda: (view := leadership.alive()) is not None and view.workers == 0, _PATIENCE_S, "degraded")
         cluster.scheduler()
         workers = [cluster.worker(), cluster.worker()]
-        eventually(lambda: ready(2), 60, "two workers again")
+        eventually(lambda: ready(2), _PATIENCE_S, "two workers again")
         assert dispatcher.poll() is None
 
         # A worker that is killed charges the one run that was on it; the nanny starts it anew.
         before = outcomes(database)
-        eventually(lambda: grids.grid(second).counts.leased == 2, 30, "two runs in flight")
+        eventually(lambda: grids.grid(second).counts.leased == 2, _PATIENCE_S, "two runs in flight")
         (victim, *_) = worker_processes(workers[0])
         victim.kill()
-        eventually(lambda: outcomes(database)["worker_lost"] == before["worker_lost"] + 1, 30, "the charge")
-        eventually(lambda: grids.grid(second).counts.done == 60, 90, "the second grid")
+        eventually(lambda: outcomes(database)["worker_lost"] == before["worker_lost"] + 1, _PATIENCE_S, "the charge")
+        eventually(lambda: grids.grid(second).counts.done == 60, _PATIENCE_S, "the second grid")
         assert set(outcomes(database)) <= {"done", "worker_lost", "scheduler_lost", "forgotten"}
         assert outcomes(database)["worker_lost"] == 1
         assert outcomes(database)["done"] == 72
         dispatcher.terminate()
-        assert dispatcher.wait(timeout=20) == 0
+        assert dispatcher.wait(timeout=_PATIENCE_S) == 0
 
 
 def _threads() -> set[int]:
