@@ -28,7 +28,7 @@ from tests.service.certificates import make_certificates
 from tests.service.plans import submit
 from tests.service.service_process import ROOT, eventually, free_port
 
-# How long a step may take on a machine that has other things to do: cold kernels alone are 20 s. Nothing is claimed of it.
+# How long a step may take on a busy machine: cold kernels alone are 20 s. Nothing is claimed of it.
 _PATIENCE_S = 150
 
 
