@@ -205,6 +205,7 @@ def measure(
             laplace,
             walkers=analysis.walkers,
             max_steps=analysis.max_steps,
+            length=analysis.chain_length,
             rng=rng,
             progress=None if report is None else lambda done: report("chain", done),
         )
@@ -222,7 +223,7 @@ def measure(
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
-            "autocorrelation times, 50 are asked for"
+            f"autocorrelation times, {analysis.chain_length:g} are asked for"
         )
     if target.refused:
         warnings.append(f"evidence: {target.refused} of {target.evaluations} inversions were refused")

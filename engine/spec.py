@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, Discriminator, Field, Strict, Tag, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
+from pydantic_core import ArgsKwargs
 
 from engine.errors import SpecError
 from engine.validation import NAME_TAG, OBJECT_TAG, name_or_object, spec_error
@@ -43,6 +44,7 @@ Declination = Annotated[Number, Field(ge=-90.0, le=90.0)]
 Exposure = Annotated[Number, Field(gt=0.0, le=1e5)]
 Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$")]
 NoiseLevel = Literal["author", "handbook"]
+ProfileName = Literal["draft", "standard", "reference", "paper"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
 RegularisationName = Literal["zeroth", "gradient", "curvature"]
 _Read = TypeVar("_Read")
@@ -273,31 +275,70 @@ class Optics:
 NOMINAL_OPTICS = Optics()
 
 
+PROFILES: dict[str, dict[str, Any]] = {
+    "draft": {"walkers": 4, "chain_length": 30.0, "max_steps": 300},
+    "standard": {},
+    "reference": {"walkers": 32, "chain_length": 100.0, "max_steps": 5000},
+    "paper": {
+        "source_pixels": (30, 30),
+        "source_envelope": False,
+        "noise_treatment": "diagonal",
+        "walkers": 14,
+        "max_steps": 1000,
+    },
+}
+"""What each profile sets otherwise than ``standard``, the defaults of :class:`Analysis`.
+
+``draft``, ``standard`` and ``reference`` sample the same posterior, ever longer. ``paper`` is the source of the paper:
+30 x 30 even pixels whose own brightness is regularised, noise without correlations.
+"""
+
+
 @dataclass(frozen=True, config=_STRICT)
 class Analysis:
     """How a run is analysed. Nothing here knows the truth.
 
+    ``profile`` names one of :data:`PROFILES`: it gives the values of what is not given here.
     ``mask_inner`` and ``mask_outer`` bound the ring of fitted pixels in units of the measured Einstein radius;
     ``core_radius`` [arcsec] is the region round each AGN image whose noise is boosted to be effectively infinite;
     ``subrays`` rays are traced along each side of an image pixel; ``ray_margin`` [pixels] is how far outside the
     mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid,
     evenly spaced where ``source_softening`` is None, else crowded round the AGN within that fraction of its half-width;
-    ``walkers`` walk the chain, or twice as many as there are parameters where that is more.
+    with ``source_envelope`` the regularisation asks for a smooth ratio of the source to the host of the parametric fit,
+    otherwise for a smooth source. ``walkers`` walk until the chain is ``chain_length`` autocorrelation times long, or
+    for ``max_steps``.
     """
 
-    source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (30, 30)
-    source_softening: Annotated[float, Field(gt=0.01, le=1e3)] | None = 0.5
+    profile: ProfileName = "standard"
+    source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (20, 20)
+    source_softening: Annotated[float, Field(gt=0.01, le=1e3)] | None = None
     regularisation: RegularisationName = "curvature"
-    noise_treatment: NoiseTreatment = "diagonal"
+    noise_treatment: NoiseTreatment = "covariance"
     mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
     mask_outer: Annotated[float, Field(gt=1.0, le=5.0)] = 1.65
     core_radius: Annotated[float, Field(ge=0.0, le=2.0)] = 0.25
     subrays: Annotated[int, Field(ge=1, le=8)] = 2
+    source_envelope: bool = True
     ray_margin: Annotated[int, Field(ge=0, le=40)] = 4
     psf_radius: Annotated[int, Field(ge=1, le=80)] = 15
-    walkers: Annotated[int, Field(ge=4, le=1000)] = 14
-    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 300
+    walkers: Annotated[int, Field(ge=2, le=1000)] = 8
+    chain_length: Annotated[float, Field(ge=10.0, le=1e4)] = 50.0
+    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 400
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_from_profile(cls, given: Any) -> Any:
+        """What is not given is the profile's."""
+        if isinstance(given, ArgsKwargs):
+            settings = given.kwargs or {}
+            if given.args:
+                return given
+            return ArgsKwargs((), {**PROFILES.get(settings.get("profile", "standard"), {}), **settings})
+        if isinstance(given, Mapping):
+            name = given.get("profile", "standard")
+            return {**(PROFILES.get(name, {}) if isinstance(name, str) else {}), **given}
+        return given
 
 
 @dataclass(frozen=True, config=_STRICT)

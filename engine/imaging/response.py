@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from engine.conventions import FloatArray
-from engine.imaging.blurring import point_source_image
+from engine.imaging.blurring import convolve, point_source_image
 from engine.imaging.drizzling import drizzle
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry
@@ -29,3 +29,7 @@ class PointResponse:
         """Drizzled image (ny, nx) of a point source of unit flux at (x, y) [arcsec, image frame]."""
         star = point_source_image(np.array([[x, y]]), np.ones(1), self.psf, self.geometry)
         return drizzle(expose(star, self.geometry, self.detector_kernel), self.geometry)
+
+    def extended_image(self, light: FloatArray) -> FloatArray:
+        """Drizzled image (ny, nx) of light on the high-resolution grid, integrated over its sub-pixels."""
+        return drizzle(expose(convolve(light, self.psf), self.geometry, self.detector_kernel), self.geometry)

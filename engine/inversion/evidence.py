@@ -163,13 +163,19 @@ def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: Sour
             f"A = F + lambda H: condition number {condition:.1e}, allowed is {MAX_CONDITION:.0e}; "
             "a larger lambda, fewer source pixels or a wider mask are needed"
         )
+    ln_z = _ln_evidence(operator, model, ln_lambda, solved)
+    if mapping.envelope is None:
+        to_brightness = np.ones(solved.solution.size)
+    else:
+        to_brightness = mapping.envelope.on_cells(mapping.grid)
+    # From here on everything is in terms of the brightness of the nodes, not of its ratio to the envelope.
     return Inversion(
-        ln_evidence=_ln_evidence(operator, model, ln_lambda, solved),
+        ln_evidence=ln_z,
         grid=mapping.grid,
-        mapping=mapping,
-        source=solved.solution.reshape(model.shape),
-        factor=solved.factor,
-        curvature=curvature,
-        data_vector=solved.data_vector,
+        mapping=mapping.of_brightness(to_brightness),
+        source=(solved.solution * to_brightness).reshape(model.shape),
+        factor=solved.factor / to_brightness[None, :],
+        curvature=curvature / np.outer(to_brightness, to_brightness),
+        data_vector=solved.data_vector / to_brightness,
         condition_number=condition,
     )

@@ -6,7 +6,9 @@ of the mask, with nodes on its edges. A ray outside the rectangle carries no lig
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,11 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.inversion.nodes import spaced_nodes
 from engine.lensing.power_law import trace_rays
+from engine.light.radial_table import look_up, tabulate
+from engine.light.sersic import SersicProfile, kernel_arguments, sersic_k, sersic_normalisation
+
+_CELL_POINTS = 8
+"""Gauss points along a cell of the source for the mean of the envelope."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +64,59 @@ def _edges(nodes: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
+class PlacedEnvelope:
+    """An envelope in the source plane of one lens: packed profile, radial table, floor."""
+
+    light: FloatArray
+    table: FloatArray
+    floor: float
+
+    def on_cells(self, grid: SourceGrid) -> FloatArray:
+        """Its mean (ny nx,) over the cells round the nodes."""
+        points, weights = np.polynomial.legendre.leggauss(_CELL_POINTS)
+        return np.asarray(
+            _envelope_means(grid.x_edges, grid.y_edges, 0.5 * (points + 1.0), 0.5 * weights, self.light, self.table)
+            + self.floor
+        )
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """The brightness that is expected of the source: a Sersic profile plus a floor, both in units of that at r_eff.
+
+    The source is modelled as this times a smooth function t, so that the regularisation asks for smoothness relative
+    to the expected run of the brightness and not of the brightness itself (cf. Nightingale et al. 2018, section 3.4,
+    who adapt its strength). ``x``, ``y`` of the profile count from the mean of the mapped anchors. Position and size go
+    with the source grid: ``size`` is the side [arcsec] of the grid for which r_eff holds, and a lens that magnifies
+    less, hence a larger grid, gets a larger envelope. What the envelope tells of the lens is then only its shape.
+    """
+
+    profile: SersicProfile
+    floor: float
+    size: float
+
+    @cached_property
+    def _table(self) -> FloatArray:
+        table = tabulate(replace(self.profile, r_eff=1.0))
+        return np.asarray(table / (sersic_normalisation(self.profile.n, 1.0) * math.exp(-sersic_k(self.profile.n))))
+
+    def placed(self, x: float, y: float, size: float) -> PlacedEnvelope:
+        """The envelope about anchors at (x, y) [arcsec] on a grid of side ``size`` [arcsec]."""
+        stretch = size / self.size
+        p = self.profile
+        moved = replace(p, flux=1.0, r_eff=p.r_eff * stretch, x=x + p.x * stretch, y=y + p.y * stretch)
+        return PlacedEnvelope(kernel_arguments(moved), self._table, self.floor)
+
+
+@dataclass(frozen=True)
 class RayBundle:
     """Rays of the image pixels that matter, ``subrays**2`` consecutive ones a pixel.
 
     ``x``, ``y`` are (pixels * subrays^2,) positions [arcsec]; ``in_mask`` (pixels,) is True for pixels of the mask,
     False for the margin whose light the PSF carries in; ``pixel_area`` [arcsec^2]; ``anchors`` (k, 2) are image
-    positions that map to where a concentrated source grid is finest: the AGN images.
+    positions that map to the centre of the source: the AGN images. ``envelope`` is the brightness that is expected of
+    the source, None where smoothness is asked of the brightness itself; ``centre`` is then an image position [arcsec]
+    that maps to its centre, or None where the envelope has no defect (:class:`Envelope`).
     """
 
     x: FloatArray
@@ -71,11 +125,18 @@ class RayBundle:
     in_mask: NDArray[np.bool_]
     pixel_area: float
     anchors: FloatArray
+    envelope: Envelope | None = None
+    centre: tuple[float, float] | None = None
 
     @property
     def pixels(self) -> int:
         """Number of image pixels with rays."""
         return self.in_mask.size
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of the blurring matrix: one a pixel, and one for the defect where there is one."""
+        return self.pixels + (self.centre is not None)
 
 
 @dataclass(frozen=True)
@@ -90,6 +151,7 @@ class Mapping:
     columns: NDArray[np.int32]
     weights: FloatArray
     entries: NDArray[np.int32]
+    envelope: PlacedEnvelope | None = None
 
     def dense(self) -> FloatArray:
         """L as an array of shape (pixels, ny nx)."""
@@ -97,6 +159,13 @@ class Mapping:
         for row, count in enumerate(self.entries):
             np.add.at(out[row], self.columns[row, :count], self.weights[row, :count])
         return out
+
+    def of_brightness(self, envelope: FloatArray) -> Mapping:
+        """The same for sources given by their brightness at the nodes, of a mapping for their ratio to an envelope."""
+        return replace(self, weights=self.weights / envelope[self._known_columns()], envelope=None)
+
+    def _known_columns(self) -> NDArray[np.int32]:
+        return np.where(np.arange(self.columns.shape[1]) < self.entries[:, None], self.columns, 0)
 
     def apply(self, source: FloatArray) -> FloatArray:
         """Image-plane fluxes (pixels,) before the PSF, of a source (ny nx,)."""
@@ -162,6 +231,7 @@ def _fill(
     x: FloatArray,
     y: FloatArray,
     ray_weight: float,
+    envelope: FloatArray,
     columns: NDArray[np.int32],
     weights: FloatArray,
     entries: NDArray[np.int32],
@@ -175,15 +245,19 @@ def _fill(
         for ray in range(pixel * per_pixel, (pixel + 1) * per_pixel):
             u, v = bx[ray], by[ray]
             if u < x[0] - tiny_x or v < y[0] - tiny_y or u > x[-1] + tiny_x or v > y[-1] + tiny_y:
-                continue
+                if not envelope.size:
+                    continue
+                # Beyond the grid the source goes on as its envelope does.
+                u, v = min(max(u, x[0]), x[-1]), min(max(v, y[0]), y[-1])
             # Neighbouring rays fall into neighbouring cells: the last cell is a good guess.
             i = _cell_of(u, x, i)
             j = _cell_of(v, y, j)
             fx = (u - x[i]) / (x[i + 1] - x[i])
             fy = (v - y[j]) / (y[j + 1] - y[j])
+            light = ray_weight * envelope[ray] if envelope.size else ray_weight
             for k in range(4):
                 a, b = k % 2, k // 2
-                weight = ray_weight * (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
+                weight = light * (fx if a else 1.0 - fx) * (fy if b else 1.0 - fy)
                 column = (j + b) * nx + i + a
                 e = 0
                 while e < used and columns[pixel, e] != column:
@@ -195,6 +269,34 @@ def _fill(
                 else:
                     weights[pixel, e] += weight
         entries[pixel] = used
+
+
+@kernel
+def _envelope_means(
+    xe: FloatArray, ye: FloatArray, points: FloatArray, gauss: FloatArray, light: FloatArray, table: FloatArray
+) -> FloatArray:
+    nx, ny = xe.size - 1, ye.size - 1
+    out = np.zeros(nx * ny)
+    for j in range(ny):
+        for i in range(nx):
+            for b in range(points.size):
+                dy = ye[j] + points[b] * (ye[j + 1] - ye[j]) - light[8]
+                for a in range(points.size):
+                    dx = xe[i] + points[a] * (xe[i + 1] - xe[i]) - light[7]
+                    u, v = light[5] * dx + light[6] * dy, light[5] * dy - light[6] * dx
+                    z = (light[4] * u * u + v * v / light[4]) * light[3]
+                    out[j * nx + i] += gauss[a] * gauss[b] * look_up(z, table)
+    return out
+
+
+@kernel
+def _envelope_at(bx: FloatArray, by: FloatArray, light: FloatArray, table: FloatArray, floor: float) -> FloatArray:
+    out = np.empty(bx.size)
+    for i in range(bx.size):
+        dx, dy = bx[i] - light[7], by[i] - light[8]
+        u, v = light[5] * dx + light[6] * dy, light[5] * dy - light[6] * dx
+        out[i] = floor + look_up((light[4] * u * u + v * v / light[4]) * light[3], table)
+    return out
 
 
 @kernel
@@ -228,8 +330,9 @@ def map_rays(
     """Trace the rays through the lens and lay the source grid of ``shape`` (ny, nx) round those of the mask.
 
     ``lens_arguments`` are those of :func:`engine.lensing.power_law.kernel_arguments`. With a ``softening`` the nodes
-    crowd round the mapped anchors: their spacing is even within that fraction of the half-width and widens beyond. An
-    InversionError tells of a mask without pixels or rays that all fall on one line of the source plane.
+    crowd round the mapped anchors: their spacing is even within that fraction of the half-width and widens beyond.
+    Where the rays have an envelope, the source is that times a function bilinear between the nodes. An InversionError
+    tells of a mask without pixels or rays that all fall on one line of the source plane.
     """
     ny, nx = shape
     if not rays.in_mask.any():
@@ -243,7 +346,7 @@ def map_rays(
             f"mask: its rays span {right - left} x {top - bottom} arcsec of the source plane, an area is needed"
         )
     centre_x, centre_y = 0.5 * (left + right), 0.5 * (bottom + top)
-    if softening is not None and rays.anchors.size:
+    if rays.anchors.size:
         ax, ay = np.empty(len(rays.anchors)), np.empty(len(rays.anchors))
         trace_rays(
             np.ascontiguousarray(rays.anchors[:, 0]), np.ascontiguousarray(rays.anchors[:, 1]), *lens_arguments, ax, ay
@@ -252,8 +355,30 @@ def map_rays(
     grid = SourceGrid(
         spaced_nodes(left, right, nx, centre_x, softening), spaced_nodes(bottom, top, ny, centre_y, softening)
     )
-    columns = np.empty((rays.pixels, 4 * per_pixel), dtype=np.int32)
-    weights = np.empty((rays.pixels, 4 * per_pixel))
-    entries = np.empty(rays.pixels, dtype=np.int32)
-    _fill(bx, by, per_pixel, grid.x, grid.y, rays.pixel_area / per_pixel, columns, weights, entries)
-    return Mapping(grid, columns, weights, entries)
+    at_rays = np.empty(0)
+    placed = None
+    if rays.envelope is not None:
+        placed = rays.envelope.placed(centre_x, centre_y, math.sqrt((right - left) * (top - bottom)))
+        at_rays = _envelope_at(bx, by, placed.light, placed.table, placed.floor)
+    columns = np.empty((rays.columns, 4 * per_pixel), dtype=np.int32)
+    weights = np.empty((rays.columns, 4 * per_pixel))
+    entries = np.empty(rays.columns, dtype=np.int32)
+    _fill(
+        bx,
+        by,
+        per_pixel,
+        grid.x,
+        grid.y,
+        rays.pixel_area / per_pixel,
+        at_rays,
+        columns,
+        weights,
+        entries[: rays.pixels],
+    )
+    if rays.centre is not None:
+        # The defect goes with t at the centre of the host: one ray, whose light is t itself.
+        cx, cy = np.empty(1), np.empty(1)
+        trace_rays(np.array([rays.centre[0]]), np.array([rays.centre[1]]), *lens_arguments, cx, cy)
+        last = slice(rays.pixels, None)
+        _fill(cx, cy, 1, grid.x, grid.y, 1.0, np.ones(1), columns[last], weights[last], entries[last])
+    return Mapping(grid, columns, weights, entries, placed)

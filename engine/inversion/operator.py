@@ -10,12 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError
-from engine.inversion.blurring import blurring_matrix
 from engine.inversion.mapping import RayBundle
 
 BLOCK = 32
@@ -86,10 +84,8 @@ def _whiten(factor: FloatArray, values: FloatArray) -> FloatArray:
 
 def build_operator(
     linear: LinearData,
-    kernel: FloatArray,
+    blurring: FloatArray,
     rays: RayBundle,
-    mask_pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
-    ray_pixels: tuple[NDArray[np.intp], NDArray[np.intp]],
 ) -> Operator:
     """Precompute an observation's operator.
 
@@ -97,12 +93,11 @@ def build_operator(
     ----------
     linear : LinearData
         Data, covariance and amplitude columns on the M pixels of the mask.
-    kernel : array
-        PSF kernel for fluxes of whole pixels (see :func:`engine.inversion.blurring.pixel_kernel`).
+    blurring : array (M, P)
+        B: what the pixels of the mask receive of the light of the P pixels with rays, and the defect where
+        there is one (then the last column).
     rays : RayBundle
         Rays of the P pixels whose light counts.
-    mask_pixels, ray_pixels : (rows, columns)
-        Where those M and P pixels lie in the image.
 
     Raises
     ------
@@ -121,7 +116,6 @@ def build_operator(
         except linalg.LinAlgError as error:
             raise InversionError(f"covariance of the noise on the mask: not positive definite ({error})") from error
         ln_c = 2.0 * float(np.log(np.diag(factor)).sum())
-    blurring = blurring_matrix(kernel, mask_pixels, ray_pixels)
     white_b = _whiten(factor, blurring)
     white_d = _whiten(factor, linear.data)
     k = linear.columns.shape[1]
@@ -136,7 +130,7 @@ def build_operator(
         white_b = white_b - q @ (q.T @ white_b)
         projected_d = white_d - q @ (q.T @ white_d)
         ln_u = 2.0 * float(np.log(pivots).sum())
-    p = rays.pixels
+    p = rays.columns
     half_w = np.zeros((p, -(-p // BLOCK) * BLOCK))
     half_w[:, :p] = np.triu(white_b.T @ white_b)
     half_w[np.arange(p), np.arange(p)] *= 0.5

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,17 +11,23 @@ from scipy.ndimage import distance_transform_edt
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
-from engine.imaging.blurring import convolve
+from engine.imaging.blurring_matrix import exposed_blurring_matrix
+from engine.imaging.extended import lensed_sersic_image
 from engine.imaging.observation import Observation
-from engine.inversion.blurring import central_stamp, pixel_kernel
-from engine.inversion.mapping import cast_rays
+from engine.inversion.blurring import blurring_matrix, central_stamp, pixel_kernel
+from engine.inversion.mapping import Envelope, RayBundle, cast_rays, map_rays
 from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.light.rendering import render_sersic
+from engine.lensing.lens_equation import solve_lens_equation
+from engine.lensing.power_law import kernel_arguments, source_position
+from engine.light.sersic import sersic_k, sersic_normalisation
 from engine.modelling.parametric import ParametricFit
 from engine.spec import Analysis
 
 CORE_BOOST = 1e3
 """Factor on the standard deviation of the pixels at the AGN cores: 'effectively infinite' (section 4.1)."""
+
+_ENVELOPE_FLOOR = 0.01
+"""Brightness, in units of the host's at its effective radius, that is expected where its profile is fainter."""
 
 _PAPER_CODE_FACTOR = 0.01
 """The paper's scripts wrote sqrt(rms^2 + 0.01 |image|) as the noise map."""
@@ -56,18 +63,15 @@ def _pixels(chosen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.int
 
 
 def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tuple[str, ...], FloatArray]:
-    ny, nx = observation.image.shape
-    scale = observation.pixel_scale
     names, images = [], []
     for k, agn in enumerate(fit.agn):
         names.append(f"agn{k + 1}")
         images.append(observation.point_source(agn.x, agn.y))
     if fit.deflector is not None:
-        light = render_sersic(fit.deflector, pixel_centres(nx, scale), pixel_centres(ny, scale), scale)
         names.append("deflector")
-        images.append(convolve(light, pixel_kernel(observation.psf, None)) / fit.deflector.flux)
+        images.append(lensed_sersic_image(observation, fit.deflector) / fit.deflector.flux)
     names.append("background")
-    images.append(np.ones((ny, nx)))
+    images.append(np.ones(observation.shape))
     return tuple(names), np.stack(images)
 
 
@@ -90,6 +94,48 @@ def _noise(
     if analysis.noise_treatment == "paper_code":
         variance = variance + _PAPER_CODE_FACTOR * np.abs(observation.image[mask])
     return np.asarray(variance + boost)
+
+
+def _blurring(
+    observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], lit: NDArray[np.bool_]
+) -> FloatArray:
+    """B (M, P): by the exposures where they are known, by the PSF stamp where not."""
+    if observation.response is not None:
+        return exposed_blurring_matrix(
+            observation.response, _pixels(mask), _pixels(lit), analysis.subrays, analysis.psf_radius
+        )
+    # Divided by the average over the rays before it is cut, not after.
+    kernel = central_stamp(pixel_kernel(observation.psf, analysis.subrays), analysis.psf_radius)
+    return blurring_matrix(kernel, _pixels(mask), _pixels(lit))
+
+
+def _envelope(fit: ParametricFit, rays: RayBundle) -> Envelope:
+    """The host of the parametric fit, placed by the AGN, on the scale of the source grid of its lens."""
+    grid = map_rays(rays, kernel_arguments(fit.lens), (2, 2)).grid
+    size = math.sqrt(float((grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])))
+    x, y = 0.5 * (grid.x[0] + grid.x[-1]), 0.5 * (grid.y[0] + grid.y[-1])
+    if rays.anchors.size:
+        ax, ay = source_position(fit.lens, rays.anchors[:, 0], rays.anchors[:, 1])
+        x, y = float(ax.mean()), float(ay.mean())
+    return Envelope(replace(fit.host, flux=1.0, x=fit.host.x - x, y=fit.host.y - y), _ENVELOPE_FLOOR, size)
+
+
+def _defect(
+    observation: Observation, fit: ParametricFit, mask: NDArray[np.bool_], rays: RayBundle, blurring: FloatArray
+) -> FloatArray:
+    """What B L lacks (M,) of the image of the envelope itself, behind the lens of the parametric fit.
+
+    Sub-rays, the sampling of the light by pixels, the cut of the PSF: all that is wrong with the image of a known
+    source can be known. It hardly changes with the lens within its posterior, and goes with t at the host's centre.
+    """
+    host, envelope = fit.host, rays.envelope
+    if envelope is None:
+        raise TypeError("rays: without an envelope there is no defect")
+    bare = replace(rays, envelope=replace(envelope, floor=0.0))
+    mapping = map_rays(bare, kernel_arguments(fit.lens), (2, 2))
+    at_r_eff = sersic_normalisation(host.n, host.r_eff) * math.exp(-sersic_k(host.n))
+    exact = lensed_sersic_image(observation, replace(host, flux=1.0 / at_r_eff), fit.lens)[mask]
+    return np.asarray(exact - blurring @ mapping.apply(np.ones(4)))
 
 
 def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Analysis) -> Problem:
@@ -119,20 +165,19 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
     core &= mask
     names, images = _amplitude_images(observation, fit)
     margin = distance_transform_edt(~mask) <= analysis.ray_margin
-    rays = cast_rays(
-        mask,
-        margin,
-        pixel_centres(shape[1], scale),
-        pixel_centres(shape[0], scale),
-        scale,
-        analysis.subrays,
-        np.array([(agn.x, agn.y) for agn in fit.agn]),
-    )
+    x, y = pixel_centres(shape[1], scale), pixel_centres(shape[0], scale)
+    anchors = np.array([(agn.x, agn.y) for agn in fit.agn])
+    rays = cast_rays(mask, margin, x, y, scale, analysis.subrays, anchors)
+    blurring = _blurring(observation, analysis, mask, mask | margin)
+    if analysis.source_envelope:
+        rays = replace(rays, envelope=_envelope(fit, rays))
+        blurring = np.column_stack([blurring, _defect(observation, fit, mask, rays, blurring)])
+        image = max(solve_lens_equation(fit.lens, fit.host.x, fit.host.y), key=lambda found: abs(found.magnification))
+        rays = replace(rays, centre=(image.x, image.y))
     linear = LinearData(
         data=observation.image[mask],
         covariance=_noise(observation, analysis, mask, core),
         columns=np.ascontiguousarray(images[:, mask].T),
     )
-    kernel = pixel_kernel(central_stamp(observation.psf, analysis.psf_radius), analysis.subrays)
-    operator = build_operator(linear, kernel, rays, _pixels(mask), _pixels(mask | margin))
+    operator = build_operator(linear, blurring, rays)
     return Problem(operator=operator, mask=mask, core=core, amplitude_names=names, amplitude_images=images)

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import PosteriorError
 from engine.imaging.blurring import convolve
+from engine.imaging.extended import lensed_sersic_image
 from engine.imaging.observation import Observation
 from engine.inversion.blurring import central_stamp, pixel_kernel
 from engine.lensing.power_law import PowerLawLens, source_position
@@ -33,6 +34,8 @@ _RESPONSE_ERROR = 0.002
 """The same where the exposures are known: what errors of position leave."""
 _POSITION_ERROR = 0.01
 """Image-plane accuracy [arcsec] asked of the AGN images as images of one source."""
+_CORRECTIONS = 2
+"""Rounds in which the quick images of deflector and host are corrected by their exact ones."""
 _MAX_ELLIPTICITY = 0.6
 
 
@@ -94,7 +97,8 @@ class _ImageModel:
             agn_light += found.flux * observation.point_source(found.x, found.y)
         sigma = np.where(observation.valid, np.hypot(observation.noise, psf_error * agn_light), 1.0)
         self.weight = np.where(observation.valid, 1.0 / sigma, 0.0).ravel()
-        self.data = np.where(observation.valid, observation.image, 0.0).ravel() * self.weight
+        self.observed = np.where(observation.valid, observation.image, 0.0).ravel() * self.weight
+        self.data = self.observed
         self.n_agn = len(detections)
         self.agn_size = 2 * self.n_agn
         self.deflector_size = 6 if deflector else 0
@@ -115,12 +119,12 @@ class _ImageModel:
         image = sample_lensed_sersic(host, lens, self.x, self.y, self.observation.pixel_scale, _HOST_SUBRAYS)
         return convolve(image, self.sampled_kernel).ravel() * self.weight
 
-    def deflector_of(self, values: Sequence[float], flux: float = 1.0) -> SersicProfile:
+    def deflector_of(self, values: Sequence[float] | FloatArray, flux: float = 1.0) -> SersicProfile:
         """The deflector's profile of its parameters ln r_eff, n, e1, e2, x, y."""
         ln_r, n, e1, e2, x, y = map(float, values)
         return SersicProfile(flux, math.exp(ln_r), n, *_ellipse(e1, e2), x, y)
 
-    def host_of(self, values: Sequence[float], flux: float = 1.0) -> SersicProfile:
+    def host_of(self, values: Sequence[float] | FloatArray, flux: float = 1.0) -> SersicProfile:
         """The host's profile of its parameters ln r_eff, n, e1, e2, x, y."""
         return self.deflector_of(values, flux)
 
@@ -129,6 +133,23 @@ class _ImageModel:
         theta_E, e1, e2, slope, x, y, *shear = map(float, values)
         q, phi = _ellipse(e1, e2)
         return PowerLawLens(theta_E, q, phi, slope, x, y, *shear)
+
+    def correct(self, values: FloatArray) -> None:
+        """Take off the data what the quick columns of deflector and host lack of their exact images at ``values``.
+
+        A fit to the corrected data with the quick columns is one with exact columns, as far as their error does not
+        change with the parameters (defect correction).
+        """
+        amplitudes, _ = self.amplitudes(values)
+        _, deflector, lens, host = self.split(values)
+        lensed = self.host_of(host, float(amplitudes[-2]))
+        defect = lensed_sersic_image(self.observation, lensed, self.lens_of(lens)).ravel() * self.weight
+        defect -= amplitudes[-2] * self._host_column(*lens.tolist(), *host.tolist())
+        if self.has_deflector:
+            light = self.deflector_of(deflector, float(amplitudes[-3]))
+            defect += lensed_sersic_image(self.observation, light).ravel() * self.weight
+            defect -= amplitudes[-3] * self._deflector_column(*deflector.tolist())
+        self.data = self.observed - defect
 
     def split(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """The parameter vector as AGN positions (k, 2), deflector, lens and host parameters."""
@@ -243,6 +264,11 @@ def fit_parametric(
     fit = least_squares(
         model.residuals, start, bounds=(low, high), x_scale="jac", loss="linear", xtol=1e-6, ftol=1e-6, max_nfev=60
     )
+    for _ in range(_CORRECTIONS):
+        model.correct(fit.x)
+        fit = least_squares(
+            model.residuals, fit.x, bounds=(low, high), x_scale="jac", xtol=1e-6, ftol=1e-6, max_nfev=20
+        )
     amplitudes, rest = model.amplitudes(fit.x)
     agn, deflector_values, lens_values, host_values = model.split(fit.x)
     host_flux, background = float(amplitudes[-2]), float(amplitudes[-1])

@@ -29,7 +29,7 @@ _BURN_IN_ROUNDS, _BURN_IN_STEPS = 2, 20
 _CHUNK = 15
 _WINDOW = 5
 AUTOCORRELATION_TIMES = 50.0
-"""A chain shorter than this many autocorrelation times is not called converged (emcee's own rule)."""
+"""Least length of a chain that is called converged, in autocorrelation times (emcee's own rule)."""
 
 
 @dataclass(frozen=True)
@@ -114,24 +114,24 @@ def run_chain(
     *,
     walkers: int,
     max_steps: int,
+    length: float = AUTOCORRELATION_TIMES,
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
 ) -> Chain:
-    """Sample the target until the chain is 50 autocorrelation times long, or ``max_steps`` are spent.
+    """Sample the target until the chain is ``length`` autocorrelation times long, or ``max_steps`` are spent.
+
+    Fewer walkers than twice the parameters cannot follow each other: they use the independence move alone.
 
     Raises
     ------
     PosteriorError
         No walker finds a place inside the prior, or none ever moves.
     """
-    # emcee wants twice as many walkers as dimensions at least.
-    walkers = max(walkers, 2 * laplace.mean.size)
     random = np.random.RandomState(int(rng.integers(2**32)))
     proposal = _IndependenceProposal(laplace.mean, laplace.covariance)
-    moves = [
-        (emcee.moves.MHMove(proposal), _INDEPENDENCE_SHARE),
-        (emcee.moves.DEMove(), 1.0 - _INDEPENDENCE_SHARE),
-    ]
+    moves = [(emcee.moves.MHMove(proposal), _INDEPENDENCE_SHARE)]
+    if walkers >= 2 * laplace.mean.size:
+        moves.append((emcee.moves.DEMove(), 1.0 - _INDEPENDENCE_SHARE))
     sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, target, moves=moves)
     state = emcee.State(_start(target, proposal, walkers, random), random_state=random.get_state())
     for _ in range(_BURN_IN_ROUNDS):
@@ -140,15 +140,15 @@ def run_chain(
         proposal.update(burnt.mean(axis=0), _blend(np.cov(burnt.T), laplace.covariance))
         sampler.reset()
     tau, steps = math.inf, 0
-    while steps < max_steps and steps < AUTOCORRELATION_TIMES * tau:
+    while steps < max_steps and steps < length * tau:
         state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
         steps = sampler.iteration
         tau = autocorrelation_time(sampler.get_chain())
         if progress is not None:
-            progress(min(1.0, steps / min(float(max_steps), AUTOCORRELATION_TIMES * tau)))
+            progress(min(1.0, steps / min(float(max_steps), length * tau)))
     if not math.isfinite(tau):
         raise PosteriorError(f"chain: no proposal was accepted in {steps} steps of {walkers} walkers")
-    status: ChainStatus = "converged" if steps >= AUTOCORRELATION_TIMES * tau else "not_converged"
+    status: ChainStatus = "converged" if steps >= length * tau else "not_converged"
     summary = ChainSummary(
         status=status,
         walkers=walkers,

@@ -59,18 +59,19 @@ class Case:
         mapping = map_rays(self.rays, kernel_arguments(LENS), model.shape)
         sx, sy = np.meshgrid(mapping.grid.x, mapping.grid.y)
         source = 4000.0 * np.exp(-0.5 * ((sx - 0.05) ** 2 + (sy + 0.03) ** 2) / 0.15**2)
-        blurring = blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed))
-        self.data = blurring @ mapping.apply(source.ravel()) + self.columns.sum(axis=1) + sigma * rng.normal(size=m)
+        self.blurring = blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed))
+        self.data = (
+            self.blurring @ mapping.apply(source.ravel()) + self.columns.sum(axis=1) + sigma * rng.normal(size=m)
+        )
         self.linear = LinearData(self.data, self.covariance, self.columns)
 
     def operator(self) -> Operator:
-        return build_operator(self.linear, self.psf, self.rays, np.nonzero(self.mask), np.nonzero(self.rayed))
+        return build_operator(self.linear, self.blurring, self.rays)
 
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""
         mapping = map_rays(self.rays, kernel_arguments(lens), model.shape, model.softening)
-        blurring = blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed))
-        g = np.hstack([blurring @ mapping.dense(), self.columns])
+        g = np.hstack([self.blurring @ mapping.dense(), self.columns])
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance
         inverse = np.linalg.inv(c)
