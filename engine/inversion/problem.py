@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.ndimage import distance_transform_edt
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
 from engine.imaging.blurring import convolve
 from engine.imaging.observation import Observation
-from engine.inversion.blurring import central_stamp, pixel_kernel
+from engine.inversion.blurring import blurring_matrix, central_stamp, pixel_kernel
 from engine.inversion.mapping import cast_rays
 from engine.inversion.operator import LinearData, Operator, build_operator
 from engine.light.rendering import render_sersic
@@ -73,8 +74,8 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
 
 def _noise(
     observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
-) -> FloatArray:
-    """Variances (M,) or covariance (M, M) of the data on the mask under the chosen treatment, cores boosted."""
+) -> FloatArray | sparse.csr_matrix:
+    """Variances (M,) or covariance (M, M, sparse) of the data on the mask under the chosen treatment, cores boosted."""
     variance = observation.noise[mask] ** 2
     boost = np.where(core[mask], variance * CORE_BOOST**2, 0.0)
     if analysis.noise_treatment == "covariance":
@@ -84,9 +85,7 @@ def _noise(
                 "allowed is 'diagonal' or 'paper_code'"
             )
         chosen = np.flatnonzero(mask)
-        covariance = observation.covariance.tocsr()[chosen][:, chosen].toarray()
-        covariance[np.diag_indices_from(covariance)] += boost
-        return np.asarray(covariance)
+        return sparse.csr_matrix(observation.covariance.tocsr()[chosen][:, chosen] + sparse.diags(boost))
     if analysis.noise_treatment == "paper_code":
         variance = variance + _PAPER_CODE_FACTOR * np.abs(observation.image[mask])
     return np.asarray(variance + boost)
@@ -134,5 +133,5 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
         columns=np.ascontiguousarray(images[:, mask].T),
     )
     kernel = pixel_kernel(central_stamp(observation.psf, analysis.psf_radius), analysis.subrays)
-    operator = build_operator(linear, kernel, rays, _pixels(mask), _pixels(mask | margin))
+    operator = build_operator(linear, blurring_matrix(kernel, _pixels(mask), _pixels(mask | margin)), rays)
     return Problem(operator=operator, mask=mask, core=core, amplitude_names=names, amplitude_images=images)

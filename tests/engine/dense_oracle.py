@@ -64,7 +64,9 @@ class Case:
         self.linear = LinearData(self.data, self.covariance, self.columns)
 
     def operator(self) -> Operator:
-        return build_operator(self.linear, self.psf, self.rays, np.nonzero(self.mask), np.nonzero(self.rayed))
+        return build_operator(
+            self.linear, blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed)), self.rays
+        )
 
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""
