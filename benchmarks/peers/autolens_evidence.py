@@ -25,9 +25,7 @@ def main() -> None:
     dataset = al.Imaging(
         data=al.Array2D.no_mask(scene["image"][::-1], pixel_scales=scale),
         noise_map=al.Array2D.no_mask(scene["noise"][::-1], pixel_scales=scale),
-        psf=al.Convolver(
-            kernel=al.Array2D.no_mask(scene["kernel"][::-1], pixel_scales=scale), normalize=False
-        ),
+        psf=al.Convolver(kernel=al.Array2D.no_mask(scene["kernel"][::-1], pixel_scales=scale), normalize=False),
     ).apply_mask(mask=mask)
     dataset = dataset.apply_over_sampling(over_sample_size_pixelization=subpixels).apply_sparse_operator_cpu()
     comps = ell_comps(float(scene["lens_q"]), float(scene["lens_phi"]))
@@ -39,9 +37,7 @@ def main() -> None:
         mesh=al.mesh.RectangularUniform(shape=tuple(int(n) for n in scene["shape"])),
         regularization=al.reg.Constant(coefficient=float(np.exp(0.5 * scene["ln_lambda"]))),
     )
-    settings = al.Settings(
-        use_positive_only_solver=False, use_edge_zeroed_pixels=False, use_border_relocator=False
-    )
+    settings = al.Settings(use_positive_only_solver=False, use_edge_zeroed_pixels=False, use_border_relocator=False)
 
     def fit() -> al.FitImaging:
         lens = al.Galaxy(
