@@ -45,9 +45,10 @@ class WhitenedData:
         """The factor written out: standard deviations (M,), or a lower triangle (M, M)."""
         bands = self.noise.bands
         if bands.shape[0] == 1:
-            return bands[0]
+            return np.asarray(bands[0])
         m = bands.shape[1]
-        return sparse.diags([band[: m - i] for i, band in enumerate(bands)], -np.arange(bands.shape[0])).toarray()
+        factor = sparse.diags([band[: m - i] for i, band in enumerate(bands)], -np.arange(bands.shape[0]))
+        return np.asarray(factor.toarray())
 
 
 @dataclass(frozen=True)
