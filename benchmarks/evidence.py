@@ -64,6 +64,8 @@ def against_autolens(observation: Observation, problem: Problem, lens: PowerLawL
         print(missing("autolens"))
         return
     side, ln_lambda, psf = 30, -9.0, central_stamp(observation.psf, 15)
+    # Theirs is normalised whatever it is told.
+    psf = psf / psf.sum()
     plain = PowerLawLens(lens.theta_E, lens.q, lens.phi, 2.0, 0.0, 0.0)
     probe = np.array([0.7, 0.4])
     deflected = np.array(deflection(plain, probe[:1], probe[1:])).ravel()
