@@ -63,9 +63,9 @@ def against_autolens(observation: Observation, problem: Problem, lens: PowerLawL
     if python is None:
         print(missing("autolens"))
         return
-    side, ln_lambda, psf = 30, -9.0, central_stamp(observation.psf, 15)
+    side, ln_lambda, stamp = 30, -9.0, central_stamp(observation.psf, 15)
     # Theirs is normalised whatever it is told.
-    psf = psf / psf.sum()
+    psf = stamp / stamp.sum()
     plain = PowerLawLens(lens.theta_E, lens.q, lens.phi, 2.0, 0.0, 0.0)
     probe = np.array([0.7, 0.4])
     deflected = np.array(deflection(plain, probe[:1], probe[1:])).ravel()
@@ -89,9 +89,8 @@ def against_autolens(observation: Observation, problem: Problem, lens: PowerLawL
                 about = json.loads(peer.stdout.readline())
                 theirs = np.load(answer)
                 # Their pixels, of the mask alone and rows from the top, in our order; their mapping in our hands.
-                rows = problem.mask.shape[0] - 1 - theirs["rows"]
-                order = np.lexsort((theirs["columns"], rows))
-                assert (rows[order] == pixels[0]).all()
+                order = np.lexsort((theirs["columns"], -theirs["rows"]))
+                assert (problem.mask.shape[0] - 1 - theirs["rows"][order] == pixels[0]).all()
                 assert (theirs["columns"][order] == pixels[1]).all()
                 axes = (pixel_centres(size, observation.pixel_scale) for size in problem.mask.shape[::-1])
                 rays = cast_rays(problem.mask, problem.mask, *axes, observation.pixel_scale, subrays)
