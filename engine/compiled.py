@@ -18,3 +18,8 @@ def kernel(function: F) -> F:
 def inlined_kernel(function: F) -> F:
     """Compile a small kernel into its callers, whose loops can then be vectorised across it."""
     return cast(F, njit(nogil=True, cache=True, inline="always")(function))
+
+
+def contracted_kernel(function: F) -> F:
+    """Compile a kernel in which a product and the sum it goes into may be one instruction, rounded once."""
+    return cast(F, njit(nogil=True, cache=True, fastmath={"contract"})(function))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, sparse
 
 from engine.compiled import kernel
 from engine.conventions import FloatArray
@@ -21,6 +21,7 @@ Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
 _NODES = 8
 """Sub-pixels along each axis between which the response is interpolated: Lagrange polynomials of order 7."""
 _LEAST_TRANSFER = 0.4
+_BLOCK = 512
 _GUARD = 16
 """Sub-pixels of zeros round the PSF, against wrapping."""
 
@@ -118,7 +119,7 @@ def _fill_matrix(
 
 def exposed_blurring_matrix(
     response: PointResponse, to: Pixels, of: Pixels, subrays: int | None, radius: int
-) -> FloatArray:
+) -> sparse.csr_matrix:
     """B of shape (len(to), len(of)): what drizzled pixel ``to`` receives of the light of pixel ``of``.
 
     Parameters
@@ -144,20 +145,30 @@ def exposed_blurring_matrix(
     shift_x, shift_y = np.array(geometry.subpixel_shifts).T
     factor = geometry.oversampling
     high_y, high_x = geometry.high_resolution_shape
-    out = np.zeros((to[0].size, of[0].size))
-    _fill_matrix(
-        out,
-        native,
-        weights.indptr.astype(np.int32),
-        geometry.margin + shift_y[index] + factor * row,
-        geometry.margin + shift_x[index] + factor * column,
-        weights.data.astype(np.float64),
-        to[0].astype(np.int64),
-        to[1].astype(np.int64),
-        of[0].astype(np.int64),
-        of[1].astype(np.int64),
-        np.asarray((of[0] - (ny - 1) / 2) * scale + (high_y - 1) / 2, dtype=np.float64),
-        np.asarray((of[1] - (nx - 1) / 2) * scale + (high_x - 1) / 2, dtype=np.float64),
-        radius,
-    )
-    return out
+    to_row, to_column = to[0].astype(np.int64), to[1].astype(np.int64)
+    first_row = geometry.margin + shift_y[index] + factor * row
+    first_column = geometry.margin + shift_x[index] + factor * column
+    at_row = np.asarray((of[0] - (ny - 1) / 2) * scale + (high_y - 1) / 2, dtype=np.float64)
+    at_column = np.asarray((of[1] - (nx - 1) / 2) * scale + (high_x - 1) / 2, dtype=np.float64)
+    blocks = []
+    # Dense in between, a few columns at a time: all of a large image at once would need gigabytes.
+    for start in range(0, of[0].size, _BLOCK):
+        some = slice(start, start + _BLOCK)
+        block = np.zeros((to_row.size, of[0][some].size))
+        _fill_matrix(
+            block,
+            native,
+            weights.indptr.astype(np.int32),
+            first_row,
+            first_column,
+            weights.data.astype(np.float64),
+            to_row,
+            to_column,
+            of[0][some].astype(np.int64),
+            of[1][some].astype(np.int64),
+            at_row[some],
+            at_column[some],
+            radius,
+        )
+        blocks.append(sparse.csc_matrix(block))
+    return sparse.hstack(blocks, format="csr")

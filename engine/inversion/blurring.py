@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, sparse
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
@@ -53,12 +53,20 @@ def central_stamp(psf: FloatArray, radius: int) -> FloatArray:
 
 def blurring_matrix(
     kernel: FloatArray, to: tuple[NDArray[np.intp], NDArray[np.intp]], of: tuple[NDArray[np.intp], NDArray[np.intp]]
-) -> FloatArray:
-    """Dense B of shape (len(to), len(of)): what pixel ``to`` (rows, columns) receives of the light of pixel ``of``."""
+) -> sparse.csr_matrix:
+    """Sparse B of shape (len(to), len(of)): what pixel ``to`` (rows, columns) receives of the light of pixel ``of``."""
     cy, cx = kernel.shape[0] // 2, kernel.shape[1] // 2
-    dy = to[0][:, None] - of[0][None, :] + cy
-    dx = to[1][:, None] - of[1][None, :] + cx
-    seen = (dy >= 0) & (dy < kernel.shape[0]) & (dx >= 0) & (dx < kernel.shape[1])
-    out = np.zeros(dy.shape)
-    out[seen] = kernel[dy[seen], dx[seen]]
-    return out
+    # Where each pixel of ``of`` stands in an image that is padded by the kernel, minus one elsewhere.
+    top, left = min(to[0].min(), of[0].min()) - cy, min(to[1].min(), of[1].min()) - cx
+    bottom, right = max(to[0].max(), of[0].max()) + cy, max(to[1].max(), of[1].max()) + cx
+    place = np.full((bottom - top + 1, right - left + 1), -1, dtype=np.int32)
+    place[of[0] - top, of[1] - left] = np.arange(of[0].size)
+    rows, columns, values = [], [], []
+    for (y, x), value in np.ndenumerate(kernel):
+        found = place[to[0] - top + cy - y, to[1] - left + cx - x]
+        row = np.flatnonzero(found >= 0).astype(np.int32)
+        rows.append(row)
+        columns.append(found[row])
+        values.append(np.full(row.size, value))
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sparse.csr_matrix(entries, shape=(to[0].size, of[0].size))

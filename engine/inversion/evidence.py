@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
+from engine.inversion.coupling import curvature_matrix, workspace
 from engine.inversion.mapping import Mapping, SourceGrid, map_rays
-from engine.inversion.operator import BLOCK, Operator
+from engine.inversion.operator import Operator
 from engine.inversion.regularisation import SourceModel, add_regularisation, ln_determinant
 from engine.lensing.power_law import PowerLawLens, kernel_arguments
 
@@ -58,46 +57,9 @@ class Inversion:
         return float((self.source_covariance() * self.curvature).sum())
 
 
-@kernel
-def _curvature(
-    half_w: FloatArray, columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], n: int
-) -> FloatArray:
-    """F = L^T W L (n, n), valid in the lower triangle; ``half_w`` as in :class:`~.operator.Operator`.
-
-    With W = V + V^T and V upper triangular, F = G + G^T for G = L^T V L. For a block of columns, T = L^T V[:, block] is
-    gathered from the rows that V has there; then L^T T^T is added to G. Blocks fit the caches, their width is a
-    constant, and the innermost loops are contiguous, so that they compile to vector instructions.
-    """
-    pixels = entries.size
-    g = np.zeros((n, n))
-    t = np.empty((n, BLOCK))
-    transposed = np.empty((BLOCK, n))
-    for start in range(0, pixels, BLOCK):
-        t[:, :] = 0.0
-        for p in range(min(start + BLOCK, pixels)):
-            for e in range(entries[p]):
-                weight = weights[p, e]
-                column = columns[p, e]
-                for k in range(BLOCK):
-                    t[column, k] += weight * half_w[p, start + k]
-        for i in range(n):
-            for k in range(BLOCK):
-                transposed[k, i] = t[i, k]
-        for k in range(min(BLOCK, pixels - start)):
-            for e in range(entries[start + k]):
-                weight = weights[start + k, e]
-                column = columns[start + k, e]
-                for i in range(n):
-                    g[column, i] += weight * transposed[k, i]
-    for i in range(n):
-        for j in range(i + 1):
-            g[i, j] += g[j, i]
-    return g
-
-
 @dataclass(frozen=True)
 class _Solved:
-    """An inversion up to its solution: ``factor`` is the upper Cholesky factor of A in Fortran order."""
+    """An inversion up to its solution: ``factor`` is the lower Cholesky factor of A in Fortran order."""
 
     mapping: Mapping
     data_vector: FloatArray
@@ -106,24 +68,25 @@ class _Solved:
 
 
 def _solve(operator: Operator, mapping: Mapping, f: FloatArray, ln_lambda: float, model: SourceModel) -> _Solved:
-    """Factorise A = F + lambda H and solve; ``f`` (valid in its lower triangle) is overwritten."""
+    """Factorise A = F + lambda H and solve; ``f`` (Fortran order, valid in its lower triangle) is overwritten."""
     d = mapping.transpose(operator.wd)
     add_regularisation(f, model, math.exp(ln_lambda))
-    # Seen in Fortran order, as LAPACK wants it, the lower triangle of f is the upper one: no copy is made.
-    factor, info = lapack.dpotrf(f.T, lower=0, clean=0, overwrite_a=1)
+    factor, info = lapack.dpotrf(f, lower=1, clean=0, overwrite_a=1)
     if info != 0:
         raise InversionError(
             f"A = F + lambda H: not positive definite at pivot {info} of {d.size} (ln lambda {ln_lambda:.3g}); "
             "a larger lambda or fewer source pixels are needed"
         )
-    solution, _ = lapack.dpotrs(factor, d, lower=0)
+    solution, _ = lapack.dpotrs(factor, d, lower=1)
     return _Solved(mapping, d, factor, solution)
 
 
-def _map_and_curve(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[Mapping, FloatArray]:
+def _map_and_curve(
+    operator: Operator, lens: PowerLawLens, model: SourceModel, memory: FloatArray | None = None
+) -> tuple[Mapping, FloatArray]:
+    """L and F, which lies in ``memory`` where that is given."""
     mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening)
-    n = model.shape[0] * model.shape[1]
-    return mapping, _curvature(operator.half_w, mapping.columns, mapping.weights, mapping.entries, n)
+    return mapping, curvature_matrix(operator.coupling, operator.border, mapping, memory)
 
 
 def _ln_evidence(operator: Operator, model: SourceModel, ln_lambda: float, solved: _Solved) -> float:
@@ -144,7 +107,8 @@ def ln_evidence(operator: Operator, lens: PowerLawLens, ln_lambda: float, model:
 
     An InversionError says what to change where A is not positive definite.
     """
-    mapping, f = _map_and_curve(operator, lens, model)
+    n = model.shape[0] * model.shape[1]
+    mapping, f = _map_and_curve(operator, lens, model, workspace.array("A", (n, n)))
     return _ln_evidence(operator, model, ln_lambda, _solve(operator, mapping, f, ln_lambda, model))
 
 
@@ -156,7 +120,7 @@ def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: Sour
     add_regularisation(a, model, math.exp(ln_lambda))
     norm = float(np.abs(a + np.tril(a, -1).T).sum(axis=0).max())
     solved = _solve(operator, mapping, f, ln_lambda, model)
-    reciprocal, _ = lapack.dpocon(solved.factor, norm, uplo="U")
+    reciprocal, _ = lapack.dpocon(solved.factor, norm, uplo="L")
     condition = math.inf if reciprocal == 0.0 else 1.0 / float(reciprocal)
     if condition > MAX_CONDITION:
         raise InversionError(
@@ -174,7 +138,7 @@ def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: Sour
         grid=mapping.grid,
         mapping=mapping.of_brightness(to_brightness),
         source=(solved.solution * to_brightness).reshape(model.shape),
-        factor=solved.factor / to_brightness[None, :],
+        factor=solved.factor.T / to_brightness[None, :],
         curvature=curvature / np.outer(to_brightness, to_brightness),
         data_vector=solved.data_vector / to_brightness,
         condition_number=condition,

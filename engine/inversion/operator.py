@@ -1,7 +1,8 @@
-"""What an observation contributes to the evidence, computed once: B^T P B, B^T P d and the constants.
+"""What an observation contributes to the evidence, computed once: B^T C^-1 B in blocks, B^T P d and the constants.
 
-Whitening with the Cholesky factor of C and projecting out the amplitude columns by a QR decomposition gives P without
-ever forming C^-1. Afterwards a non-diagonal covariance and any number of amplitudes cost nothing in an evaluation.
+P = C^-1 - C^-1 U (U^T C^-1 U)^-1 U^T C^-1 marginalises the amplitudes. B^T C^-1 B is sparse, since pixels far apart do
+not share light, but B^T P B is not: the amplitudes are kept as a border T (P, k) with B^T P B = B^T C^-1 B - T T^T.
+Neither C^-1 nor any other matrix of M x M, M x P or P x P is ever formed.
 """
 
 from __future__ import annotations
@@ -10,23 +11,44 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, sparse
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError
+from engine.inversion.coupling import PixelCoupling, couple_pixels
 from engine.inversion.mapping import RayBundle
-
-BLOCK = 32
-"""Columns that the curvature kernel works on at once: a block of T then fits the second-level cache."""
+from engine.inversion.whitening import NoiseFactor, factorise_noise
 
 
 @dataclass(frozen=True)
 class LinearData:
-    """Data on the mask: d (M,), its covariance (M,) variances or (M, M), amplitude columns U (M, k)."""
+    """Data on the mask: d (M,), amplitude columns U (M, k), and the noise.
+
+    The ``covariance`` is variances (M,) or a matrix (M, M), which is best sparse: drizzling correlates neighbours only.
+    """
 
     data: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray | sparse.spmatrix
     columns: FloatArray
+
+
+@dataclass(frozen=True)
+class WhitenedData:
+    """d (M,) and U (M, k) divided by the Cholesky factor of C, and that factor."""
+
+    data: FloatArray
+    columns: FloatArray
+    noise: NoiseFactor
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The factor written out: standard deviations (M,), or a lower triangle (M, M)."""
+        bands = self.noise.bands
+        if bands.shape[0] == 1:
+            return np.asarray(bands[0])
+        m = bands.shape[1]
+        factor = sparse.diags([band[: m - i] for i, band in enumerate(bands)], -np.arange(bands.shape[0]))
+        return np.asarray(factor.toarray())
 
 
 @dataclass(frozen=True)
@@ -36,9 +58,11 @@ class Operator:
     Attributes
     ----------
     rays : RayBundle
-        The P image pixels whose light counts.
-    half_w : array (P, P rounded up to BLOCK)
-        The upper triangle of B^T P B with half its diagonal: V in B^T P B = V + V^T; columns beyond P are zero.
+        The image pixels whose light counts.
+    coupling : PixelCoupling
+        B^T C^-1 B.
+    border : array (P, k)
+        T: B^T P B = B^T C^-1 B - T T^T.
     wd : array (P,)
         B^T P d.
     dd : float
@@ -47,57 +71,47 @@ class Operator:
         -1/2 ln|C| - 1/2 ln|U^T C^-1 U| - (M - k)/2 ln 2 pi.
     data_points, amplitudes : int
         M and k.
-    blurring : array (M, P)
+    blurring : sparse array (M, P)
         B, for model images.
-    whitened : LinearData
-        d and U divided by the Cholesky factor of C, for amplitudes (``covariance`` holds the factor).
+    whitened : WhitenedData
+        For amplitudes and chi^2.
     """
 
     rays: RayBundle
-    half_w: FloatArray
+    coupling: PixelCoupling
+    border: FloatArray
     wd: FloatArray
     dd: float
     ln_constant: float
     data_points: int
     amplitudes: int
-    blurring: FloatArray
-    whitened: LinearData
+    blurring: sparse.csr_matrix
+    whitened: WhitenedData
 
     def fit_amplitudes(self, arc: FloatArray) -> FloatArray:
         """Best amplitudes (k,) for a given model of the lensed host on the mask (M,)."""
-        rest = self.whitened.data - _whiten(self.whitened.covariance, arc)
+        rest = self.whitened.data - self.whitened.noise.whiten(arc)
         solution, *_ = linalg.lstsq(self.whitened.columns, rest)
         return np.asarray(solution)
 
     def chi2(self, arc: FloatArray, amplitudes: FloatArray) -> float:
         """Chi^2 of a model: lensed host on the mask (M,) plus amplitudes (k,) times their columns."""
-        rest = self.whitened.data - _whiten(self.whitened.covariance, arc) - self.whitened.columns @ amplitudes
+        rest = self.whitened.data - self.whitened.noise.whiten(arc) - self.whitened.columns @ amplitudes
         return float(rest @ rest)
 
 
-def _whiten(factor: FloatArray, values: FloatArray) -> FloatArray:
-    """C^(-1/2) values, with ``factor`` the standard deviations (M,) or the lower Cholesky factor (M, M)."""
-    if factor.ndim == 1:
-        return np.asarray(values / (factor if values.ndim == 1 else factor[:, None]))
-    return np.asarray(linalg.solve_triangular(factor, values, lower=True, check_finite=False))
-
-
-def build_operator(
-    linear: LinearData,
-    blurring: FloatArray,
-    rays: RayBundle,
-) -> Operator:
+def build_operator(linear: LinearData, blurring: sparse.spmatrix | FloatArray, rays: RayBundle) -> Operator:
     """Precompute an observation's operator.
 
     Parameters
     ----------
     linear : LinearData
         Data, covariance and amplitude columns on the M pixels of the mask.
-    blurring : array (M, P)
-        B: what the pixels of the mask receive of the light of the P pixels with rays, and the defect where
-        there is one (then the last column).
+    blurring : sparse or dense array (M, P)
+        B: what each pixel of the mask receives of the light of each pixel with rays, of any values. Columns beyond
+        those pixels may follow.
     rays : RayBundle
-        Rays of the P pixels whose light counts.
+        Rays of the pixels whose light counts.
 
     Raises
     ------
@@ -105,43 +119,31 @@ def build_operator(
         The covariance is not positive definite, or the amplitude columns are not independent on the mask.
     """
     m = linear.data.size
-    if linear.covariance.ndim == 1:
-        if not (linear.covariance > 0).all():
-            raise InversionError("noise: it has a pixel without positive variance on the mask")
-        factor = np.sqrt(linear.covariance)
-        ln_c = float(np.log(linear.covariance).sum())
-    else:
-        try:
-            factor = linalg.cholesky(linear.covariance, lower=True, check_finite=False)
-        except linalg.LinAlgError as error:
-            raise InversionError(f"covariance of the noise on the mask: not positive definite ({error})") from error
-        ln_c = 2.0 * float(np.log(np.diag(factor)).sum())
-    white_b = _whiten(factor, blurring)
-    white_d = _whiten(factor, linear.data)
+    blurring = sparse.csr_matrix(blurring)
+    noise = factorise_noise(linear.covariance)
+    white_d = noise.whiten(linear.data)
     k = linear.columns.shape[1]
-    white_u = _whiten(factor, linear.columns)
+    white_u = noise.whiten(linear.columns)
     ln_u = 0.0
     projected_d = white_d
+    border = np.zeros((blurring.shape[1], 0))
     if k:
         q, r = np.linalg.qr(white_u)
         pivots = np.abs(np.diag(r))
         if not pivots.min() > 1e-10 * pivots.max():
             raise InversionError("amplitudes: their columns are not independent on the mask; leave one out")
-        white_b = white_b - q @ (q.T @ white_b)
         projected_d = white_d - q @ (q.T @ white_d)
         ln_u = 2.0 * float(np.log(pivots).sum())
-    p = rays.columns
-    half_w = np.zeros((p, -(-p // BLOCK) * BLOCK))
-    half_w[:, :p] = np.triu(white_b.T @ white_b)
-    half_w[np.arange(p), np.arange(p)] *= 0.5
+        border = np.ascontiguousarray(blurring.T @ noise.whiten_transposed(q))
     return Operator(
         rays=rays,
-        half_w=half_w,
-        wd=white_b.T @ projected_d,
+        coupling=couple_pixels(blurring, noise, rays),
+        border=border,
+        wd=np.asarray(blurring.T @ noise.whiten_transposed(projected_d)),
         dd=float(projected_d @ projected_d),
-        ln_constant=-0.5 * (ln_c + ln_u + (m - k) * math.log(2.0 * math.pi)),
+        ln_constant=-0.5 * (noise.ln_determinant + ln_u + (m - k) * math.log(2.0 * math.pi)),
         data_points=m,
         amplitudes=k,
         blurring=blurring,
-        whitened=LinearData(white_d, factor, white_u),
+        whitened=WhitenedData(white_d, white_u, noise),
     )

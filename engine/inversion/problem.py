@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.ndimage import distance_transform_edt
 
 from engine.conventions import FloatArray, pixel_centres
@@ -77,8 +78,8 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
 
 def _noise(
     observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
-) -> FloatArray:
-    """Variances (M,) or covariance (M, M) of the data on the mask under the chosen treatment, cores boosted."""
+) -> FloatArray | sparse.csr_matrix:
+    """Variances (M,) or covariance (M, M, sparse) of the data on the mask under the chosen treatment, cores boosted."""
     variance = observation.noise[mask] ** 2
     boost = np.where(core[mask], variance * CORE_BOOST**2, 0.0)
     if analysis.noise_treatment == "covariance":
@@ -88,9 +89,7 @@ def _noise(
                 "allowed is 'diagonal' or 'paper_code'"
             )
         chosen = np.flatnonzero(mask)
-        covariance = observation.covariance.tocsr()[chosen][:, chosen].toarray()
-        covariance[np.diag_indices_from(covariance)] += boost
-        return np.asarray(covariance)
+        return sparse.csr_matrix(observation.covariance.tocsr()[chosen][:, chosen] + sparse.diags(boost))
     if analysis.noise_treatment == "paper_code":
         variance = variance + _PAPER_CODE_FACTOR * np.abs(observation.image[mask])
     return np.asarray(variance + boost)
@@ -98,7 +97,7 @@ def _noise(
 
 def _blurring(
     observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], lit: NDArray[np.bool_]
-) -> FloatArray:
+) -> sparse.csr_matrix:
     """B (M, P): by the exposures where they are known, by the PSF stamp where not."""
     if observation.response is not None:
         return exposed_blurring_matrix(
@@ -121,7 +120,7 @@ def _envelope(fit: ParametricFit, rays: RayBundle) -> Envelope:
 
 
 def _defect(
-    observation: Observation, fit: ParametricFit, mask: NDArray[np.bool_], rays: RayBundle, blurring: FloatArray
+    observation: Observation, fit: ParametricFit, mask: NDArray[np.bool_], rays: RayBundle, blurring: sparse.csr_matrix
 ) -> FloatArray:
     """What B L lacks (M,) of the image of the envelope itself, behind the lens of the parametric fit.
 
@@ -171,7 +170,8 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
     blurring = _blurring(observation, analysis, mask, mask | margin)
     if analysis.source_envelope:
         rays = replace(rays, envelope=_envelope(fit, rays))
-        blurring = np.column_stack([blurring, _defect(observation, fit, mask, rays, blurring)])
+        defect = _defect(observation, fit, mask, rays, blurring)
+        blurring = sparse.hstack([blurring, defect[:, None]], format="csr")
         image = max(solve_lens_equation(fit.lens, fit.host.x, fit.host.y), key=lambda found: abs(found.magnification))
         rays = replace(rays, centre=(image.x, image.y))
     linear = LinearData(
