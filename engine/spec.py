@@ -44,7 +44,7 @@ Exposure = Annotated[Number, Field(gt=0.0, le=1e5)]
 Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$")]
 NoiseLevel = Literal["author", "handbook"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
-RegularisationName = Literal["zeroth", "gradient", "curvature"]
+RegularisationName = Literal["zeroth", "gradient", "curvature", "matern"]
 _Read = TypeVar("_Read")
 _SLOPE_TOLERANCE = 1e-9
 
@@ -282,12 +282,14 @@ class Analysis:
     ``subrays`` rays are traced along each side of an image pixel; ``ray_margin`` [pixels] is how far outside the
     mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid,
     evenly spaced where ``source_softening`` is None, else crowded round the AGN within that fraction of its half-width;
+    ``regularisation_length`` is the correlation length of ``matern`` [source pixels], without effect otherwise;
     ``walkers`` walk the chain, or twice as many as there are parameters where that is more.
     """
 
     source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (30, 30)
     source_softening: Annotated[float, Field(gt=0.01, le=1e3)] | None = 0.5
     regularisation: RegularisationName = "curvature"
+    regularisation_length: Annotated[float, Field(ge=0.1, le=100.0)] = 3.0
     noise_treatment: NoiseTreatment = "diagonal"
     mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
     mask_outer: Annotated[float, Field(gt=1.0, le=5.0)] = 1.65
@@ -327,6 +329,8 @@ class Realization:
         # Left out where it is not used, so that realizations from before there was such a field keep their digests.
         if dumped["optics"] is None:
             del dumped["optics"]
+        if dumped["analysis"]["regularisation"] != "matern":
+            del dumped["analysis"]["regularisation_length"]
         return dumped
 
     @property

@@ -126,6 +126,12 @@ def _map_and_curve(operator: Operator, lens: PowerLawLens, model: SourceModel) -
     return mapping, _curvature(operator.half_w, mapping.columns, mapping.weights, mapping.entries, n)
 
 
+def normal_equations(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[FloatArray, FloatArray]:
+    """F (n, n), of which the lower triangle is valid, and D (n,) of a lens: all that the data say of its source."""
+    mapping, f = _map_and_curve(operator, lens, model)
+    return f, mapping.transpose(operator.wd)
+
+
 def _ln_evidence(operator: Operator, model: SourceModel, ln_lambda: float, solved: _Solved) -> float:
     n = solved.solution.size
     quadratic = float(solved.data_vector @ solved.solution)
