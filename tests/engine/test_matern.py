@@ -31,7 +31,7 @@ def test_the_inverse_of_h_is_the_matern_covariance(length: float) -> None:
     for dy, dx in ((0, 3), (0, 6), (4, 4), (9, 2), (0, 15)):
         r = z * np.hypot(dx, dy)
         correlation = covariance[middle + dy, middle + dx] / covariance[middle, middle]
-        assert correlation == pytest.approx(r * k1(r), abs=0.2 * error)
+        assert correlation == pytest.approx(r * k1(r), abs=0.5 * error)
 
 
 @pytest.mark.parametrize("softening", [None, 0.15, 1e3])
