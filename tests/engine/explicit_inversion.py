@@ -129,12 +129,8 @@ class Explicit:
         light = np.zeros((SIDE, SIDE, ny, nx))
         for row, column in np.argwhere(self.rayed):
             for u, v in zip(bx[row, column], by[row, column], strict=True):
-                if not (x[0] - 1e-12 <= u <= x[-1] + 1e-12 and y[0] - 1e-12 <= v <= y[-1] + 1e-12):
-                    continue
-                i = min(max(int(np.searchsorted(x, u, side="right")) - 1, 0), nx - 2)
-                j = min(max(int(np.searchsorted(y, v, side="right")) - 1, 0), ny - 2)
-                a, b = (u - x[i]) / (x[i + 1] - x[i]), (v - y[j]) / (y[j + 1] - y[j])
-                light[row, column, j : j + 2, i : i + 2] += np.outer([1 - b, b], [1 - a, a])
+                a, b = _hats(x, u), _hats(y, v)
+                light[row, column] += np.outer(b, a)
         light *= SCALE**2 / self.subrays**2
         psf, flat = stamp(self.psf), light.reshape(SIDE, SIDE, ny * nx)
         blurred = np.zeros_like(flat)
@@ -170,6 +166,14 @@ class Explicit:
 
     def changed(self, **values: object) -> "Explicit":
         return replace(self, **values)  # type: ignore[arg-type]
+
+
+def _hats(nodes: np.ndarray, value: float) -> np.ndarray:
+    """The piecewise linear functions that are one at a node and zero at its neighbours, ghosts beyond the ends too."""
+    ghosts = np.concatenate([[2 * nodes[0] - nodes[1]], nodes, [2 * nodes[-1] - nodes[-2]]])
+    rising = (value - ghosts[:-2]) / np.diff(ghosts)[:-1]
+    falling = (ghosts[2:] - value) / np.diff(ghosts)[1:]
+    return np.clip(np.minimum(rising, falling), 0.0, None)
 
 
 @dataclass(frozen=True)
