@@ -20,6 +20,9 @@ from engine.lensing.power_law import PowerLawLens, kernel_arguments
 MAX_CONDITION = 1e14
 """Beyond this the solution has lost all but two digits."""
 
+MAX_LN_LAMBDA = 700.0
+"""Beyond it lambda or its inverse is no number of float64."""
+
 
 @dataclass(frozen=True)
 class Inversion:
@@ -95,6 +98,26 @@ def _curvature(
     return g
 
 
+def least_condition(factor: FloatArray) -> float:
+    """A lower bound of A's condition number from the diagonal of its Cholesky factor, at no cost."""
+    diagonal = np.diag(factor)
+    return float((diagonal.max() / diagonal.min()) ** 2)
+
+
+def _untrusted(condition: float, ln_lambda: float) -> InversionError:
+    return InversionError(
+        f"A = F + lambda H: condition number {condition:.1e}, allowed is {MAX_CONDITION:.0e} (ln lambda "
+        f"{ln_lambda:.3g}); a larger lambda, fewer source pixels or a wider mask are needed"
+    )
+
+
+def _strength(ln_lambda: float) -> float:
+    """Lambda of its logarithm; an InversionError where that is no number of float64."""
+    if not abs(ln_lambda) < MAX_LN_LAMBDA:
+        raise InversionError(f"ln lambda: got {ln_lambda}, allowed is -{MAX_LN_LAMBDA:g} to {MAX_LN_LAMBDA:g}")
+    return math.exp(ln_lambda)
+
+
 @dataclass(frozen=True)
 class _Solved:
     """An inversion up to its solution: ``factor`` is the upper Cholesky factor of A in Fortran order."""
@@ -108,7 +131,7 @@ class _Solved:
 def _solve(operator: Operator, mapping: Mapping, f: FloatArray, ln_lambda: float, model: SourceModel) -> _Solved:
     """Factorise A = F + lambda H and solve; ``f`` (valid in its lower triangle) is overwritten."""
     d = mapping.transpose(operator.wd)
-    add_regularisation(f, model, math.exp(ln_lambda))
+    add_regularisation(f, model, _strength(ln_lambda))
     # Seen in Fortran order, as LAPACK wants it, the lower triangle of f is the upper one: no copy is made.
     factor, info = lapack.dpotrf(f.T, lower=0, clean=0, overwrite_a=1)
     if info != 0:
@@ -116,6 +139,9 @@ def _solve(operator: Operator, mapping: Mapping, f: FloatArray, ln_lambda: float
             f"A = F + lambda H: not positive definite at pivot {info} of {d.size} (ln lambda {ln_lambda:.3g}); "
             "a larger lambda or fewer source pixels are needed"
         )
+    least = least_condition(factor)
+    if least > MAX_CONDITION:
+        raise _untrusted(least, ln_lambda)
     solution, _ = lapack.dpotrs(factor, d, lower=0)
     return _Solved(mapping, d, factor, solution)
 
@@ -159,16 +185,13 @@ def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: Sour
     mapping, f = _map_and_curve(operator, lens, model)
     curvature = np.tril(f) + np.tril(f, -1).T
     a = np.tril(f)
-    add_regularisation(a, model, math.exp(ln_lambda))
+    add_regularisation(a, model, _strength(ln_lambda))
     norm = float(np.abs(a + np.tril(a, -1).T).sum(axis=0).max())
     solved = _solve(operator, mapping, f, ln_lambda, model)
     reciprocal, _ = lapack.dpocon(solved.factor, norm, uplo="U")
     condition = math.inf if reciprocal == 0.0 else 1.0 / float(reciprocal)
     if condition > MAX_CONDITION:
-        raise InversionError(
-            f"A = F + lambda H: condition number {condition:.1e}, allowed is {MAX_CONDITION:.0e}; "
-            "a larger lambda, fewer source pixels or a wider mask are needed"
-        )
+        raise _untrusted(condition, ln_lambda)
     return Inversion(
         ln_evidence=_ln_evidence(operator, model, ln_lambda, solved),
         grid=mapping.grid,

@@ -107,9 +107,13 @@ def build_operator(
     Raises
     ------
     InversionError
-        The covariance is not positive definite, or the amplitude columns are not independent on the mask.
+        Data, noise or columns are not finite, the covariance is not positive definite, or the amplitude columns are
+        not independent on the mask.
     """
     m = linear.data.size
+    for name, values in (("data", linear.data), ("noise", linear.covariance), ("amplitudes", linear.columns)):
+        if not np.isfinite(values).all():
+            raise InversionError(f"{name}: not finite in some pixels of the mask; leave them out of it")
     if linear.covariance.ndim == 1:
         if not (linear.covariance > 0).all():
             raise InversionError("noise: it has a pixel without positive variance on the mask")

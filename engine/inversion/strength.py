@@ -26,7 +26,7 @@ from scipy.optimize import brentq
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError, SpecError
-from engine.inversion.evidence import normal_equations
+from engine.inversion.evidence import MAX_CONDITION, least_condition, normal_equations
 from engine.inversion.operator import Operator
 from engine.inversion.regularisation import (
     SourceModel,
@@ -73,12 +73,12 @@ class _Slope:
 
 
 def _slope(f: FloatArray, d: FloatArray, ln_lambda: float, model: SourceModel) -> _Slope | None:
-    """Phi at one ln lambda; None where A is not positive definite in float64. ``f`` is lower triangular F."""
+    """Phi at one ln lambda; None where A cannot be trusted in float64. ``f`` is lower triangular F."""
     strength = math.exp(ln_lambda)
     a = f.copy()
     add_regularisation(a, model, strength)
     factor, info = lapack.dpotrf(a.T, lower=0, clean=0, overwrite_a=1)
-    if info != 0:
+    if info != 0 or least_condition(factor) > MAX_CONDITION:
         return None
     h = sparse_regularisation(model)
     solution, _ = lapack.dpotrs(factor, d, lower=0)
