@@ -165,7 +165,7 @@ def _fraction(value: float, nodes: FloatArray, i: int) -> float:
     last = nodes.size - 1
     inner = min(max(i, 0), last - 1)
     side = nodes[inner + 1] - nodes[inner]
-    return (value - (nodes[0] - side if i < 0 else nodes[i])) / side
+    return float((value - (nodes[0] - side if i < 0 else nodes[i])) / side)
 
 
 @kernel

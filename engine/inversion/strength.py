@@ -24,6 +24,7 @@ import numpy as np
 from scipy.linalg import eigvalsh_tridiagonal, lapack, solve_triangular
 from scipy.optimize import brentq
 
+from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError, SpecError
 from engine.inversion.evidence import MAX_CONDITION, least_condition, normal_equations
@@ -44,8 +45,8 @@ _LAST_STEP = 0.03
 """A Newton step this short leaves an error of about its square, below the tolerance: it is taken without a check."""
 _LONGEST_STEP = 8.0
 _MAX_FACTORISATIONS = 60
-_DECIDED = 1e-8
-"""Where gamma is below this share of n, every mode falls as 1 / lambda, and tr(X) - lambda tr(X^2) is rounding."""
+_DECIDED = 1e-6
+"""Where gamma is below this share of n, every mode falls as 1 / lambda, and n - lambda tr(X) is rounding."""
 _SPECTRUM_ROUNDING = 64.0 * np.finfo(np.float64).eps
 
 
@@ -72,6 +73,29 @@ class _Slope:
     gamma: float
 
 
+@kernel
+def _mirror(matrix: FloatArray) -> None:
+    """Copy the upper triangle of a Fortran-ordered matrix into its lower one, by blocks that fit the cache."""
+    n, block = matrix.shape[0], 32
+    for first in range(0, n, block):
+        for second in range(first, n, block):
+            for j in range(second, min(second + block, n)):
+                for i in range(first, min(first + block, j)):
+                    matrix[j, i] = matrix[i, j]
+
+
+@kernel
+def _trace_of_square(matrix: FloatArray) -> float:
+    """tr(X X), by blocks that fit the cache."""
+    n, block, total = matrix.shape[0], 32, 0.0
+    for first in range(0, n, block):
+        for second in range(0, n, block):
+            for i in range(first, min(first + block, n)):
+                for j in range(second, min(second + block, n)):
+                    total += matrix[i, j] * matrix[j, i]
+    return total
+
+
 def _slope(f: FloatArray, d: FloatArray, ln_lambda: float, model: SourceModel) -> _Slope | None:
     """Phi at one ln lambda; None where A cannot be trusted in float64. ``f`` is lower triangular F."""
     strength = math.exp(ln_lambda)
@@ -83,18 +107,19 @@ def _slope(f: FloatArray, d: FloatArray, ln_lambda: float, model: SourceModel) -
     h = sparse_regularisation(model)
     solution, _ = lapack.dpotrs(factor, d, lower=0)
     inverse, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
-    inverse = np.triu(inverse)
-    inverse += np.triu(inverse, 1).T
-    x = np.asarray(h @ inverse)
-    # tr(A^-1 F) itself: n - lambda tr(X) would lose it where the prior decides nearly everything.
-    gamma = float(2.0 * (np.tril(f, -1) * inverse).sum() + np.diag(f) @ np.diag(inverse))
+    _mirror(inverse)
+    rows, columns = h.nonzero()
+    trace = float(h.data @ inverse[rows, columns])
+    gamma = d.size - strength * trace
+    if gamma > _DECIDED * d.size:
+        x = np.asarray(h @ inverse.T)
+        falls = strength * trace - strength**2 * float(_trace_of_square(x))
+    else:
+        gamma = falls = float(2.0 * (np.tril(f, -1) * inverse).sum() + np.diag(f) @ np.diag(inverse))
     hs = h @ solution
     penalty = strength * float(solution @ hs)
     if not (gamma > 0.0 and penalty > 0.0):
         return None
-    falls = gamma
-    if gamma > _DECIDED * d.size:
-        falls = strength * float(np.trace(x)) - strength**2 * float((x * x.T).sum())
     rises = penalty - 2.0 * strength**2 * float(hs @ inverse @ hs)
     return _Slope(math.log(gamma / penalty), -falls / gamma - rises / penalty, gamma)
 

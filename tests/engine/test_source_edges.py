@@ -56,14 +56,14 @@ def _traced(rays: RayBundle, lens: PowerLawLens) -> tuple[np.ndarray, np.ndarray
 
 
 def changes(rays: RayBundle, lens: PowerLawLens, name: str, signature: Callable) -> list[tuple[float, float]]:
-    """Pairs of values 1e-11 apart between which the signature changes, at most three along the range of a parameter."""
+    """Pairs of values 1e-8 apart between which the signature changes, at most three along the range of a parameter."""
     centre = getattr(lens, name)
     values = centre + np.linspace(-1.0, 1.0, 24) * RANGES[name]
     found = [signature(rays, lens.with_values(**{name: float(v)})) for v in values]
     pairs = []
     for k in np.flatnonzero([a != b for a, b in pairwise(found)])[:3]:
         low, high, at_low = float(values[k]), float(values[k + 1]), found[k]
-        while high - low > 1e-11:
+        while high - low > 1e-8:
             middle = 0.5 * (low + high)
             if signature(rays, lens.with_values(**{name: middle})) == at_low:
                 low = middle
@@ -87,6 +87,5 @@ def test_the_evidence_does_not_jump(fitted: Fitted, signature: Callable, softeni
             )
             jumps.append(abs(high - low))
     assert len(jumps) >= 5
-    # Below 1 is asked for. ln Z changes by less than 1e5 for a change of one in any parameter, so by 1e-6 over 1e-11;
-    # its rounding is some 1e-6.
-    assert max(jumps) < 1e-4
+    # Below 1 is asked for. ln Z changes by less than 1e5 for a change of one in any parameter, so by 1e-3 over 1e-8.
+    assert max(jumps) < 1e-2
