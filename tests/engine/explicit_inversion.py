@@ -169,8 +169,9 @@ class Explicit:
 
 
 def _hats(nodes: np.ndarray, value: float) -> np.ndarray:
-    """The piecewise linear functions that are one at a node and zero at its neighbours, ghosts beyond the ends too."""
-    ghosts = np.concatenate([[2 * nodes[0] - nodes[1]], nodes, [2 * nodes[-1] - nodes[-2]]])
+    """Piecewise linear: one at a node, zero at its neighbours, with ghosts a quarter of a cell beyond the ends."""
+    low, high = nodes[0] - 0.25 * (nodes[1] - nodes[0]), nodes[-1] + 0.25 * (nodes[-1] - nodes[-2])
+    ghosts = np.concatenate([[low], nodes, [high]])
     rising = (value - ghosts[:-2]) / np.diff(ghosts)[:-1]
     falling = (ghosts[2:] - value) / np.diff(ghosts)[1:]
     return np.clip(np.minimum(rising, falling), 0.0, None)

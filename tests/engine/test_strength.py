@@ -46,10 +46,10 @@ def test_the_strength_is_the_maximum_of_the_evidence_with_its_curvature(model: S
     numeric = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (12 * step**2)
     assert reduced.curvature == pytest.approx(numeric, rel=1e-5)
     # The last Newton step, below 0.03, is not followed by a factorisation.
-    assert newton.curvature == pytest.approx(numeric, rel=0.02)
+    assert newton.curvature == pytest.approx(numeric, rel=0.003)
     expected = invert(operator, LENS, reduced.ln_lambda, model).effective_parameters()
     assert reduced.effective_parameters == pytest.approx(expected, rel=1e-8)
-    assert newton.effective_parameters == pytest.approx(expected, rel=0.02)
+    assert newton.effective_parameters == pytest.approx(expected, rel=0.005)
 
 
 @pytest.mark.parametrize("away", [-15.0, -6.0, -1.0, 0.0, 1.0, 6.0, 15.0])
@@ -95,8 +95,9 @@ def test_data_without_a_source_have_no_strength() -> None:
     noise = 0.5 * np.sqrt(scene.covariance) * np.random.default_rng(5).normal(size=scene.data.size)
     scene.linear = LinearData(noise, scene.covariance, scene.columns)
     operator = scene.operator()
-    with pytest.raises(InversionError, match="stands out"):
-        find_strength(operator, LENS, model)
+    for start in (None, *np.arange(-12.0, 80.0, 4.0)):
+        with pytest.raises(InversionError, match="stands out"):
+            find_strength(operator, LENS, model, start=start)
     with pytest.raises(InversionError, match="upper"):
         reduce_strengths(operator, LENS, model).optimum()
 
