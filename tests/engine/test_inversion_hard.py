@@ -282,17 +282,11 @@ def test_where_the_solve_cannot_be_trusted_an_error_says_what_to_change() -> Non
     assert max(accepted) < MAX_CONDITION
 
 
-def test_the_evidence_refuses_what_it_knows_to_be_rounding() -> None:
-    operator, model = Explicit().operator(), SourceModel((30, 30))
-    refused = 0
-    for ln_lambda in np.arange(-80.0, -40.0, 2.0):
-        try:
-            ln_evidence(operator, LENS, float(ln_lambda), model)
-        except InversionError as error:
-            refused += 1
-            last = str(error)
-    assert refused > 10
-    assert "larger lambda" in last
+@pytest.mark.parametrize("ln_lambda", [-80.0, -65.0, -56.0, -50.0])
+def test_the_evidence_refuses_what_it_knows_to_be_rounding(ln_lambda: float) -> None:
+    # Here rounding often leaves A positive definite, with numbers that mean nothing.
+    with pytest.raises(InversionError, match="larger lambda"):
+        ln_evidence(Explicit().operator(), LENS, ln_lambda, SourceModel((12, 12)))
 
 
 @pytest.mark.parametrize("ln_lambda", [-800.0, 800.0, math.nan])
