@@ -194,7 +194,12 @@ def measure(
         problem = prepare_problem(observation, fit, analysis)
     with watch.stage("optimum"):
         prior = flat_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear)
-        source = SourceModel(analysis.source_pixels, analysis.regularisation, analysis.source_softening)
+        source = SourceModel(
+            analysis.source_pixels,
+            analysis.regularisation,
+            analysis.source_softening,
+            analysis.regularisation_length,
+        )
         target = Target(problem.operator, prior, source)
         start = target.vector(fit.lens, optimal_strength(target, fit.lens))
         laplace = find_optimum(target, start, start_covariance(fit.lens_covariance))

@@ -46,7 +46,7 @@ Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-
 NoiseLevel = Literal["author", "handbook"]
 ProfileName = Literal["draft", "standard", "reference", "paper"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
-RegularisationName = Literal["zeroth", "gradient", "curvature"]
+RegularisationName = Literal["zeroth", "gradient", "curvature", "matern"]
 _Read = TypeVar("_Read")
 _SLOPE_TOLERANCE = 1e-9
 
@@ -307,12 +307,14 @@ class Analysis:
     with ``source_envelope`` the regularisation asks for a smooth ratio of the source to the host of the parametric fit,
     otherwise for a smooth source. ``walkers`` walk until the chain is ``chain_length`` autocorrelation times long, or
     for ``max_steps``.
+    ``regularisation_length`` is the correlation length of ``matern`` [source pixels], without effect otherwise.
     """
 
     profile: ProfileName = "standard"
     source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (20, 20)
     source_softening: Annotated[float, Field(gt=0.01, le=1e3)] | None = None
     regularisation: RegularisationName = "curvature"
+    regularisation_length: Annotated[float, Field(ge=0.1, le=100.0)] = 3.0
     noise_treatment: NoiseTreatment = "covariance"
     mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
     mask_outer: Annotated[float, Field(gt=1.0, le=5.0)] = 1.65
@@ -368,6 +370,8 @@ class Realization:
         # Left out where it is not used, so that realizations from before there was such a field keep their digests.
         if dumped["optics"] is None:
             del dumped["optics"]
+        if dumped["analysis"]["regularisation"] != "matern":
+            del dumped["analysis"]["regularisation_length"]
         return dumped
 
     @property

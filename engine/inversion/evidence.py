@@ -19,6 +19,9 @@ from engine.lensing.power_law import PowerLawLens, kernel_arguments
 MAX_CONDITION = 1e14
 """Beyond this the solution has lost all but two digits."""
 
+MAX_LN_LAMBDA = 700.0
+"""Beyond it lambda or its inverse is no number of float64."""
+
 
 @dataclass(frozen=True)
 class Inversion:
@@ -57,6 +60,26 @@ class Inversion:
         return float((self.source_covariance() * self.curvature).sum())
 
 
+def least_condition(factor: FloatArray) -> float:
+    """A lower bound of A's condition number from the diagonal of its Cholesky factor, at no cost."""
+    diagonal = np.diag(factor)
+    return float((diagonal.max() / diagonal.min()) ** 2)
+
+
+def _untrusted(condition: float, ln_lambda: float) -> InversionError:
+    return InversionError(
+        f"A = F + lambda H: condition number {condition:.1e}, allowed is {MAX_CONDITION:.0e} (ln lambda "
+        f"{ln_lambda:.3g}); a larger lambda, fewer source pixels or a wider mask are needed"
+    )
+
+
+def _strength(ln_lambda: float) -> float:
+    """Lambda of its logarithm; an InversionError where that is no number of float64."""
+    if not abs(ln_lambda) < MAX_LN_LAMBDA:
+        raise InversionError(f"ln lambda: got {ln_lambda}, allowed is -{MAX_LN_LAMBDA:g} to {MAX_LN_LAMBDA:g}")
+    return math.exp(ln_lambda)
+
+
 @dataclass(frozen=True)
 class _Solved:
     """An inversion up to its solution: ``factor`` is the lower Cholesky factor of A in Fortran order."""
@@ -70,13 +93,16 @@ class _Solved:
 def _solve(operator: Operator, mapping: Mapping, f: FloatArray, ln_lambda: float, model: SourceModel) -> _Solved:
     """Factorise A = F + lambda H and solve; ``f`` (Fortran order, valid in its lower triangle) is overwritten."""
     d = mapping.transpose(operator.wd)
-    add_regularisation(f, model, math.exp(ln_lambda))
+    add_regularisation(f, model, _strength(ln_lambda))
     factor, info = lapack.dpotrf(f, lower=1, clean=0, overwrite_a=1)
     if info != 0:
         raise InversionError(
             f"A = F + lambda H: not positive definite at pivot {info} of {d.size} (ln lambda {ln_lambda:.3g}); "
             "a larger lambda or fewer source pixels are needed"
         )
+    least = least_condition(factor)
+    if least > MAX_CONDITION:
+        raise _untrusted(least, ln_lambda)
     solution, _ = lapack.dpotrs(factor, d, lower=1)
     return _Solved(mapping, d, factor, solution)
 
@@ -87,6 +113,12 @@ def _map_and_curve(
     """L and F, which lies in ``memory`` where that is given."""
     mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening)
     return mapping, curvature_matrix(operator.coupling, operator.border, mapping, memory)
+
+
+def normal_equations(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[FloatArray, FloatArray]:
+    """F (n, n), of which the lower triangle is valid, and D (n,) of a lens: all that the data say of its source."""
+    mapping, f = _map_and_curve(operator, lens, model)
+    return f, mapping.transpose(operator.wd)
 
 
 def _ln_evidence(operator: Operator, model: SourceModel, ln_lambda: float, solved: _Solved) -> float:
@@ -117,16 +149,13 @@ def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: Sour
     mapping, f = _map_and_curve(operator, lens, model)
     curvature = np.tril(f) + np.tril(f, -1).T
     a = np.tril(f)
-    add_regularisation(a, model, math.exp(ln_lambda))
+    add_regularisation(a, model, _strength(ln_lambda))
     norm = float(np.abs(a + np.tril(a, -1).T).sum(axis=0).max())
     solved = _solve(operator, mapping, f, ln_lambda, model)
     reciprocal, _ = lapack.dpocon(solved.factor, norm, uplo="L")
     condition = math.inf if reciprocal == 0.0 else 1.0 / float(reciprocal)
     if condition > MAX_CONDITION:
-        raise InversionError(
-            f"A = F + lambda H: condition number {condition:.1e}, allowed is {MAX_CONDITION:.0e}; "
-            "a larger lambda, fewer source pixels or a wider mask are needed"
-        )
+        raise _untrusted(condition, ln_lambda)
     ln_z = _ln_evidence(operator, model, ln_lambda, solved)
     if mapping.envelope is None:
         to_brightness = np.ones(solved.solution.size)

@@ -116,9 +116,14 @@ def build_operator(linear: LinearData, blurring: sparse.spmatrix | FloatArray, r
     Raises
     ------
     InversionError
-        The covariance is not positive definite, or the amplitude columns are not independent on the mask.
+        Data, noise or columns are not finite, the covariance is not positive definite, or the amplitude columns are
+        not independent on the mask.
     """
     m = linear.data.size
+    covariance = linear.covariance.data if sparse.issparse(linear.covariance) else linear.covariance
+    for name, values in (("data", linear.data), ("noise", covariance), ("amplitudes", linear.columns)):
+        if not np.isfinite(values).all():
+            raise InversionError(f"{name}: not finite in some pixels of the mask; leave them out of it")
     blurring = sparse.csr_matrix(blurring)
     noise = factorise_noise(linear.covariance)
     white_d = noise.whiten(linear.data)

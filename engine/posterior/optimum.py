@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from engine.conventions import FloatArray
-from engine.errors import PosteriorError
+from engine.errors import InversionError, PosteriorError
+from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens
 from engine.posterior.target import Target
 
@@ -29,26 +29,22 @@ class Laplace:
 
 
 def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, high: float = 20.0) -> float:
-    """Ln lambda that maximises the evidence of a lens, to 0.01, by Brent's method between ``low`` and ``high``.
+    """Ln lambda that maximises the evidence of a lens, to 1e-3, between ``low`` and ``high`` and inside the prior.
+
+    The factorisations that it took count as evaluations of the target.
 
     Raises
     ------
     PosteriorError
-        The maximum lies at an end of the interval.
+        There is no maximum inside the interval.
     """
     low, high = max(low, float(target.prior.low[-1])), min(high, float(target.prior.high[-1]))
-    grid = np.linspace(low, high, 13)[1:-1]
-    values = [target(target.vector(lens, float(s))) for s in grid]
-    best = int(np.argmax(values))
-    if not math.isfinite(values[best]) or best in (0, grid.size - 1):
-        raise PosteriorError(f"ln lambda: no maximum of the evidence between {low:.1f} and {high:.1f} for {lens}")
-    found = minimize_scalar(
-        lambda s: -target(target.vector(lens, float(s))),
-        bounds=(grid[best - 1], grid[best + 1]),
-        method="bounded",
-        options={"xatol": 0.01},
-    )
-    return float(found.x)
+    try:
+        found = find_strength(target.operator, lens, target.source, low=low, high=high)
+    except InversionError as error:
+        raise PosteriorError(f"{error} ({lens})") from error
+    target.evaluations += found.factorisations
+    return found.ln_lambda
 
 
 def _quadratic_model(

@@ -169,15 +169,17 @@ def test_noise_that_is_not_positive_and_dependent_amplitudes_are_refused() -> No
         scene.operator()
 
 
-def test_a_ray_outside_the_grid_carries_no_light_and_the_extreme_rays_lie_on_its_edge() -> None:
+def test_rays_of_the_mask_are_inside_the_grid_and_those_far_outside_carry_no_light() -> None:
     scene = Case(subrays=1)
     mapping = map_rays(scene.rays, kernel_arguments(LENS), (7, 7))
     inside = mapping.entries > 0
     assert inside[scene.rays.in_mask].all()
     total = np.array([mapping.weights[p, : mapping.entries[p]].sum() for p in range(mapping.entries.size)])
-    # Bilinear weights of a ray add up to one ray's area.
-    assert np.allclose(total[inside], SCALE**2, rtol=1e-12)
+    # Bilinear weights of a ray add up to one ray's area, to less where the source falls to zero beyond the grid.
+    assert np.allclose(total[scene.rays.in_mask], SCALE**2, rtol=1e-9)
+    assert ((total[inside] > 0) & (total[inside] <= SCALE**2 * (1 + 1e-12))).all()
     assert (~inside).any()
+    assert (total[~scene.rays.in_mask & inside] < 0.99 * SCALE**2).any()
 
 
 def test_the_pixel_kernel_undoes_the_average_over_the_subrays() -> None:

@@ -95,7 +95,7 @@ def test_exact_point_sources_beat_shifted_stamps_beside_the_agn(
 
 def test_the_mask_is_a_ring_with_its_cores_boosted(simulation: Simulation, fit: ParametricFit) -> None:
     observation = simulation.observation
-    problem = prepare_problem(observation, fit, Analysis())
+    problem = prepare_problem(observation, fit, Analysis(noise_treatment="diagonal"))
     radius = 1.65 * fit.lens.theta_E
     assert problem.mask.sum() * 0.08**2 == pytest.approx(math.pi * radius**2 * (1 - (0.4 / 1.65) ** 2), rel=0.02)
     variance = problem.operator.whitened.covariance**2
@@ -126,4 +126,4 @@ def test_a_ring_without_valid_pixels_is_refused(simulation: Simulation, fit: Par
     corner = np.zeros(observation.shape, dtype=bool)
     corner[0, 0] = True
     with pytest.raises(ObservationError, match="mask"):
-        prepare_problem(replace(observation, valid=corner), fit, Analysis())
+        prepare_problem(replace(observation, valid=corner), fit, Analysis(noise_treatment="diagonal"))

@@ -1,0 +1,122 @@
+"""The strength of HE0435's regularisation: factorisations and time of three ways, after their answers agree.
+
+Brent's method is what the engine used before: eleven evaluations of a grid 60 wide in ln lambda, then a bounded search
+to 0.01. All three start from F and D, which do not depend on lambda.
+"""
+
+import math
+
+import numpy as np
+from scipy.linalg import lapack
+from scipy.optimize import minimize_scalar
+from threadpoolctl import threadpool_limits
+
+from benchmarks.timing import least
+from engine.conventions import FloatArray
+from engine.inversion.evidence import ln_evidence, normal_equations
+from engine.inversion.mapping import map_rays
+from engine.inversion.operator import Operator
+from engine.inversion.problem import prepare_problem
+from engine.inversion.regularisation import SourceModel, add_regularisation, ln_determinant, regularisation_matrix
+from engine.inversion.strength import find_strength, reduce_strengths
+from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.modelling.parametric import fit_parametric
+from engine.scene import build_scene
+from engine.simulation import simulate
+from engine.spec import Analysis, Host, Realization
+
+MODELS = (
+    SourceModel((30, 30), "curvature", 0.5),
+    SourceModel((30, 30), "gradient"),
+    SourceModel((30, 30), "zeroth"),
+    SourceModel((30, 30), "matern", 0.5),
+    SourceModel((45, 45), "curvature", 0.5),
+)
+
+
+def brent(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[float, int]:
+    """Ln lambda and the number of factorisations."""
+    f, d = normal_equations(operator, lens, model)
+    count = 0
+
+    def minus_ln_evidence(ln_lambda: float) -> float:
+        nonlocal count
+        count += 1
+        a = f.copy()
+        add_regularisation(a, model, math.exp(ln_lambda))
+        factor, info = lapack.dpotrf(a.T, lower=0, clean=0, overwrite_a=1)
+        if info:
+            return math.inf
+        solution, _ = lapack.dpotrs(factor, d, lower=0)
+        return 0.5 * (2 * np.log(np.diag(factor)).sum() - ln_determinant(model) - d.size * ln_lambda - d @ solution)
+
+    grid = np.linspace(-40.0, 20.0, 13)[1:-1]
+    best = int(np.argmin([minus_ln_evidence(float(t)) for t in grid]))
+    found = minimize_scalar(
+        minus_ln_evidence, bounds=(grid[best - 1], grid[best + 1]), method="bounded", options={"xatol": 0.01}
+    )
+    return float(found.x), count
+
+
+def single_precision(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, ...]:
+    """Errors of ln Z where W, or W, L and their products, or the factorisation too are in float32."""
+    exact = ln_evidence(operator, lens, ln_lambda, model)
+    f, d = normal_equations(operator, lens, model)
+    f = np.tril(f) + np.tril(f, -1).T
+    dense = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening).dense()
+    p = operator.rays.pixels
+    w = operator.half_w[:, :p] + operator.half_w[:, :p].T
+    rounded_w = w.astype(np.float32).astype(np.float64)
+    single = (dense.T.astype(np.float32) @ (w.astype(np.float32) @ dense.astype(np.float32))).astype(np.float64)
+    h = math.exp(ln_lambda) * regularisation_matrix(model)
+    constant = operator.ln_constant - 0.5 * operator.dd + 0.5 * (ln_determinant(model) + d.size * ln_lambda)
+
+    def value(f: FloatArray, dtype: type) -> float:
+        a = (f + h).astype(dtype)
+        factor, info = (lapack.spotrf if dtype is np.float32 else lapack.dpotrf)(a)
+        if info:
+            return math.nan
+        solution, _ = (lapack.spotrs if dtype is np.float32 else lapack.dpotrs)(factor, d.astype(dtype))
+        return constant + 0.5 * float(d @ solution) - float(np.log(np.diag(factor).astype(np.float64)).sum())
+
+    assert abs(value(f, np.float64) - exact) < 1e-6
+    trials = (value(dense.T @ rounded_w @ dense, np.float64), value(single, np.float64), value(f, np.float32))
+    return tuple(trial - exact for trial in trials)
+
+
+def main() -> None:
+    spec = Realization(system="HE0435", l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=20.5))
+    with threadpool_limits(1):
+        scene = build_scene(spec)
+        observation = simulate(scene, "author", np.random.default_rng(0)).observation
+        operator = prepare_problem(observation, fit_parametric(observation, agn_images=4), Analysis()).operator
+        lens = scene.lens
+        print(f"{'':>24} {'Brent':>20} {'Newton':>20} {'reduction':>20} {'each lambda':>12}")
+        for model in MODELS:
+            reduction = reduce_strengths(operator, lens, model)
+            best = reduction.optimum()
+            newton = find_strength(operator, lens, model)
+            old, count = brent(operator, lens, model)
+            assert abs(newton.ln_lambda - best.ln_lambda) < 1e-3, (newton, best)
+            assert abs(old - best.ln_lambda) < 2e-2, (old, best)
+            for away in (-3.0, 0.0, 3.0):
+                exact = ln_evidence(operator, lens, best.ln_lambda + away, model)
+                assert abs(reduction.ln_evidence(best.ln_lambda + away) - exact) < 1e-6
+            times = (
+                least(lambda model=model: brent(operator, lens, model), 3),
+                least(lambda model=model: find_strength(operator, lens, model), 3),
+                least(lambda model=model: reduce_strengths(operator, lens, model), 3),
+                least(lambda r=reduction, t=best.ln_lambda: r.ln_evidence(t), 5),
+            )
+            name = f"{model.regularisation} {model.shape[0]}x{model.shape[1]}"
+            counts = (count, newton.factorisations, 1)
+            cells = " ".join(f"{k:>4} x {t * 1e3:9.0f} ms " for k, t in zip(counts, times[:3], strict=True))
+            print(f"{name:>24} {cells} {times[3] * 1e6:9.0f} us")
+        model = MODELS[0]
+        strength = find_strength(operator, lens, model).ln_lambda
+        errors = single_precision(operator, lens, strength, model)
+        print("error of ln Z with float32: W {:.1e}; W, L and F {:.1e}; the factorisation {:.1e}".format(*errors))
+
+
+if __name__ == "__main__":
+    main()

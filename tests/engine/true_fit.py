@@ -1,0 +1,23 @@
+"""The truth of a scene in the form of a parametric fit, for tests of what comes after the fit."""
+
+import numpy as np
+
+from engine.modelling.parametric import ParametricFit
+from engine.modelling.point_sources import Detection
+from engine.scene import Scene
+
+
+def true_fit(scene: Scene) -> ParametricFit:
+    names = ("theta_E", "q", "phi", "slope", "x", "y")
+    return ParametricFit(
+        lens=scene.lens,
+        host=scene.host,
+        deflector=scene.deflector,
+        agn=tuple(Detection(source.x, source.y, source.flux, 1e3) for source in scene.agn),
+        background=0.0,
+        lens_names=names,
+        lens_covariance=1e-6 * np.eye(len(names)),
+        chi2=0.0,
+        degrees_of_freedom=1,
+        evaluations=0,
+    )
