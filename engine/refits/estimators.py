@@ -153,15 +153,22 @@ def refit_draws(
     for estimator in estimators:
         metric = _metric(estimator, drawn)
         wide: Fits | None = None
+        spread: tuple[FloatArray, FloatArray] | None = None
         for prior, inside in bounds.items():
             fits = _fit(metric, start, inside, wide if prior == "free" else None)
             if prior == "wide":
                 wide = fits
                 start = np.asarray(fits.shapes[0] if fits.fluxes[0] > 0 else start)
-            shapes, fluxes = fits.shapes, fits.fluxes
-            if estimator in _DATA_ESTIMATORS:
-                # The same random numbers for every prior: what differs between them is not chance.
+            # The same random numbers for every prior: what differs between them is not chance, and scatter that stays
+            # within a narrower range need not be drawn again.
+            if not (fits is wide and spread is not None and inside.hold(spread[0]).all()):
                 generators = [np.random.default_rng(seed) for seed in seeds]
-                shapes, fluxes = scatter(metric, every, fits, inside.low, inside.high, generators)
+                added = estimator in _DATA_ESTIMATORS
+                spread = (
+                    scatter(metric, every, fits, inside.low, inside.high, generators)
+                    if added
+                    else (fits.shapes, fits.fluxes)
+                )
+            shapes, fluxes = spread
             out.append(Refit(estimator, prior, _flagged(fits, shapes, fluxes, inside)))
     return out

@@ -21,8 +21,8 @@ _FLUX = COLUMNS - 1
 _MAX_ROUNDS = 40
 _FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1e-3, 1e-6, 1e8
 _CALMER, _STRONGER = 0.1, 10.0
-_ENOUGH = 1e-4
-"""A predicted gain below this, in units of chi^2, ends a fit: 0.01 of a standard deviation."""
+_ENOUGH = 1e-3
+"""A predicted gain in half the chi^2 below this ends a fit: 0.05 of a standard deviation at most."""
 
 
 @dataclass(frozen=True)

@@ -27,11 +27,11 @@ MAX_ELLIPTICITY = 0.6
 """Bound of e1 and of e2: q is above 0.08, and above 0.25 along the axes."""
 
 _INDEX_STEP = 1e-5
-_CORE_SHARE = 3e-4
+_CORE_SHARE = 3e-3
 """A cell of the size of the core that holds this share of the flux is not cut any more."""
 _MAX_DEPTH = 10
 """Halvings of a cell at most."""
-_CLEARANCE = 2.0
+_CLEARANCE = 1.5
 """Distance from the centre, in units of a cell's size, from which four points give the mean to 1e-3 of itself."""
 _STACK = 3 * _MAX_DEPTH + 4
 _GAUSS = 1.0 / math.sqrt(3.0)

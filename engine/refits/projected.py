@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import blas
 
 from engine.conventions import FloatArray
 from engine.refits.draws import SourceDraw
@@ -22,7 +23,7 @@ class ProjectedMetric:
 
     def __init__(self, draws: Sequence[SourceDraw]) -> None:
         self._edges = [(draw.grid.x_edges, draw.grid.y_edges) for draw in draws]
-        self._curvatures = [draw.curvature for draw in draws]
+        self._curvatures = [np.asfortranarray(draw.curvature.T) for draw in draws]
         self._data = [draw.data_vector for draw in draws]
 
     def normal_equations(self, which: NDArray[np.intp], shapes: FloatArray) -> NormalEquations:
@@ -30,5 +31,6 @@ class ProjectedMetric:
         found = []
         for k, shape in zip(which, shapes, strict=True):
             columns = columns_on_grid(shape, *self._edges[k])
-            found.append((columns.T @ (self._curvatures[k] @ columns), columns.T @ self._data[k], 1.0))
+            seen = blas.dsymm(1.0, self._curvatures[k], np.asfortranarray(columns))
+            found.append((columns.T @ seen, columns.T @ self._data[k], 1.0))
         return stacked(found)
