@@ -40,8 +40,8 @@ class Estimate:
     Total magnitude [AB], r_eff [arcsec, intermediate axis], n, q, position angle [deg], centre x, y [arcsec, source
     plane in the image frame]; ``r_eff_galfit`` is GALFIT's radius, on the major axis: r_eff / sqrt(q).
 
-    ``at_bound`` counts the draws whose fit ended at a bound of n or of r_eff, ``n_at_bound`` and ``r_eff_at_bound`` those
-    of each; ``failed`` counts those that could not be fitted and are left out of the means.
+    ``at_bound`` counts the draws whose fit ended at a bound of n or of r_eff, ``n_at_bound`` and ``r_eff_at_bound``
+    those of each; ``failed`` counts those that could not be fitted and are left out of the means.
     """
 
     estimator: EstimatorName
@@ -65,9 +65,9 @@ class Estimate:
 class Aperture:
     """AB magnitude of the drawn source maps within ``radius`` [arcsec] of the host's centre, without a profile.
 
-    The centre is that of the ``paper`` fit to the same map, n in the wide range. ``coverage`` is the share of the circle
-    that the source grid covers, in the mean: light beyond it is not seen. ``failed`` counts the draws without a centre
-    or without light.
+    The centre is that of the ``paper`` fit to the same map, n in the wide range. ``coverage`` is the share of the
+    circle that the source grid covers, in the mean: light beyond it is not seen. ``failed`` counts the draws without
+    a centre or without light.
     """
 
     radius: float
@@ -90,8 +90,8 @@ class ChainSummary:
     """How well the posterior is sampled.
 
     ``tau`` is the integrated autocorrelation time in steps, largest over the parameters; ``effective_samples`` the
-    number of independent samples that it leaves. ``r_hat`` is the split R-hat (see :mod:`engine.posterior.convergence`),
-    None where it was not computed.
+    number of independent samples that it leaves; ``r_hat`` the split R-hat (:mod:`engine.posterior.convergence`), None
+    where it was not computed.
     """
 
     status: ChainStatus
@@ -144,8 +144,8 @@ class Products:
 class RunResult:
     """The outcome of one run.
 
-    ``profile`` names the analysis profile, None where the analysis was put together by hand. An estimator that could not
-    fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
+    ``profile`` names the analysis profile, None where the analysis was put together by hand. An estimator that could
+    not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
     ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.
     ``arc_magnitude`` is the AB magnitude of the lensed host in the image plane, ``agn_contrast`` AGN minus arc
     magnitude, ``surface_brightness`` the host's mean surface brightness inside r_eff [mag arcsec^-2] (the paper's

@@ -221,9 +221,8 @@ def measure(
             progress=None if report is None else lambda done: report("chain", done),
         )
     with watch.stage("draws"):
-        draws = []
-        for state in chain.thinned(analysis.draws, rng):
-            draws.append(source_draw(target.invert(state), target.lens(state), rng))
+        states = chain.thinned(analysis.draws, rng)
+        draws = [source_draw(target.invert(state), target.lens(state), rng) for state in states]
         flat_ln = chain.ln_posterior.ravel()
         best = target.invert(chain.flat()[int(np.argmax(flat_ln))])
         products, chi2 = _products(observation, problem, best, target, chain, truth)

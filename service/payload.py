@@ -178,6 +178,7 @@ def result_payload(
     InvalidResultError
         A number is not finite or a part is missing; the message names the first.
     """
+    found = {f"{e.estimator}_{e.index_prior}": _estimate(e) for e in result.estimates}
     return read_payload(
         {
             "realization_digest": result.realization_digest,
@@ -186,10 +187,7 @@ def result_payload(
             "noise_treatment": result.noise_treatment,
             "regularisation": result.regularisation,
             "profile": result.profile,
-            "estimates": {
-                **dict.fromkeys(ESTIMATES),
-                **{f"{e.estimator}_{e.index_prior}": _estimate(e) for e in result.estimates},
-            },
+            "estimates": {name: found.get(name) for name in ESTIMATES} | found,
             "aperture": None if result.aperture is None else _aperture(result.aperture),
             "lens": {parameter.name: _quantity(parameter.value) for parameter in result.lens},
             "chain": {name: _plain(getattr(result.chain, name)) for name in ChainPayload.model_fields},

@@ -21,7 +21,7 @@ ROWS: tuple[tuple[EstimateName, str, str], ...] = (
     ("image_wide", "r_eff", "R_eff (image)"),
     ("image_wide", "n", "n (image)"),
 )
-"""What is shown of each input: by the estimator ``paper`` with n in 1-4 where nothing is said, ``image`` with n in 0.3-8."""
+"""What is shown of each input: by ``paper`` with n in 1-4 where nothing is said, by ``image`` with n in 0.3-8."""
 
 
 def value_of(estimate: SummaryEstimate, quantity: str) -> SummaryValue:

@@ -24,14 +24,16 @@ def r_hat(groups: FloatArray) -> float:
 
 
 def split_r_hat(samples: FloatArray) -> float:
-    """R-hat of a chain (steps, walkers, parameters) against itself: two halves of the walkers, each in two halves of time.
+    """R-hat of a chain (steps, walkers, parameters) against itself: halves of the walkers by halves of the time.
 
     A drift shows between the times, a part of the ensemble that is stuck between the walkers. Needs four steps and two
     walkers.
     """
     steps, walkers, parameters = samples.shape
     if steps < 4 or walkers < 2:
-        raise ValueError(f"samples: got {steps} steps of {walkers} walkers, allowed are four steps and two walkers at least")
+        raise ValueError(
+            f"samples: got {steps} steps of {walkers} walkers, allowed are four steps and two walkers at least"
+        )
     half, side = steps // 2, walkers // 2
     parts = [
         samples[start : start + half, first : first + side].reshape(-1, parameters)

@@ -1,7 +1,7 @@
 """``image``: the ray-traced Sersic fitted to the data themselves, at the lens of each draw.
 
-chi^2 = f^2 x^T W x - 2 f x^T B^T P d + d^T P d, with x(p) the flux in each image pixel of the ray-traced profile of unit
-flux, W = B^T P B, and amplitudes marginalised as in the inversion. There is no source grid and no regularisation.
+chi^2 = f^2 x^T W x - 2 f x^T B^T P d + d^T P d, with x(p) the flux in each image pixel of the ray-traced profile of
+unit flux, W = B^T P B, and amplitudes marginalised as in the inversion. There is no source grid, no regularisation.
 
 A pixel's flux is the mean over its rays, which is what the blurring is made for; where a ray's share of the pixel comes
 near the centre of the profile, that share is integrated. The share maps to a parallelogram by the lens' Jacobian.
@@ -24,8 +24,10 @@ from engine.refits.least_squares import NormalEquations
 from engine.refits.profiles import COLUMNS, add_cell, add_point, new_stack, shape_arguments
 
 _CLEARANCE = 6.0
-"""Distance of a share from the centre, in units of its size, from which its ray stands for it: an integral is smoother than
-rays by the share itself, which shows where light is steep (test of the noise-free arc)."""
+"""Distance of a share from the centre, in units of its size, from which its ray stands for it.
+
+An integral is smoother than rays by the share itself, which shows where the one ends and the other begins. The arc of
+HE0435 (n = 4, R_eff = 0.39 arcsec) comes out 0.3-0.4 % too faint with 1.5 to 3, 0.07 % with 6."""
 
 
 @kernel

@@ -104,10 +104,11 @@ def _bounded_step(
 ) -> FloatArray:
     """Steps (k, 6) that minimise the damped quadratic model inside the bounds; what would cross one stops there."""
     k, d = gradient.shape
-    diagonal = np.einsum("kii->ki", hessian)
-    floor = 1e-12 * diagonal.max(axis=1, initial=0.0)[:, None] + 1e-300
+    # Where the model puts no light on the data, rounding is all that is left of the curvature.
+    diagonal = np.maximum(np.einsum("kii->ki", hessian), 0.0)
+    floor = 1e-12 * diagonal.max(axis=1)[:, None] + 1e-200
     damped = hessian.copy()
-    damped[:, range(d), range(d)] += damping[:, None] * diagonal + floor
+    damped[:, range(d), range(d)] = (1.0 + damping[:, None]) * diagonal + floor
     pinned = np.zeros((k, d), dtype=np.bool_)
     shift = np.zeros((k, d))
     for _ in range(d + 1):
@@ -125,9 +126,7 @@ def _bounded_step(
     return shift
 
 
-def fit_shapes(
-    metric: Metric, which: NDArray[np.intp], starts: FloatArray, low: FloatArray, high: FloatArray
-) -> Fits:
+def fit_shapes(metric: Metric, which: NDArray[np.intp], starts: FloatArray, low: FloatArray, high: FloatArray) -> Fits:
     """Minimise the metric over shape and flux of the draws ``which`` (K,).
 
     Parameters
@@ -209,6 +208,4 @@ def _truncated(
         inside = ((tried >= low) & (tried <= high)).all(axis=1)
         if inside.any():
             return np.asarray(tried[inside.argmax()])
-    return np.clip(tried[0], low, high)
-
-
+    return np.asarray(np.clip(tried[0], low, high))

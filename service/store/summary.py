@@ -79,7 +79,11 @@ def _row(row: tuple[Any, ...]) -> dict[str, Any]:
                 "bias": bias / bias_runs if bias_runs else None,
             }
         estimates[name] = estimate
-    return {"input": {name: row[_AT[name]] for name in GROUP_COLUMNS}, "n_runs": row[_AT["runs"]], "estimates": estimates}
+    return {
+        "input": {name: row[_AT[name]] for name in GROUP_COLUMNS},
+        "n_runs": row[_AT["runs"]],
+        "estimates": estimates,
+    }
 
 
 def _overall(row: Row[*tuple[Any, ...]], estimate: str) -> OverallEstimate | None:

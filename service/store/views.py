@@ -136,7 +136,9 @@ def result_view(row: Row[Any]) -> ResultView:
     )
     plain = [name for name in ResultView.model_fields if name not in {"estimates", "aperture", "lens", "chain"}]
     aperture = _aperture_view(column)
-    return ResultView(estimates=estimates, aperture=aperture, lens=lens, chain=chain, **{name: column[name] for name in plain})
+    return ResultView(
+        estimates=estimates, aperture=aperture, lens=lens, chain=chain, **{name: column[name] for name in plain}
+    )
 
 
 def _recovered(column: RowMapping, prefix: str) -> Recovered | None:

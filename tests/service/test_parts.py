@@ -17,7 +17,17 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 import engine.figures
-from engine.result import ESTIMATORS, INDEX_PRIORS, Aperture, ChainSummary, Estimate, LensParameter, Quantity, RunResult, StageTime
+from engine.result import (
+    ESTIMATORS,
+    INDEX_PRIORS,
+    Aperture,
+    ChainSummary,
+    Estimate,
+    LensParameter,
+    Quantity,
+    RunResult,
+    StageTime,
+)
 from engine.spec import Analysis
 from service.api.app import create_app
 from service.artefacts import ArtefactStore
