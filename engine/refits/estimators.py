@@ -106,16 +106,19 @@ def _metric(estimator: EstimatorName, drawn: DrawSet) -> Metric:
 
 
 def _fit(metric: Metric, start: FloatArray, bounds: _Bounds, wider: Fits | None) -> Fits:
-    """Fit the first draw from ``start`` (6,) and all draws from there; ``wider`` are fits with a wider prior of n."""
-    which = np.arange(len(bounds.low))
+    """Fit the first draw from ``start`` (6,) and all draws from there.
+
+    With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that fit.
+    """
     if wider is not None:
-        which = which[~bounds.hold(wider.shapes)]
-        if not which.size:
+        outside = np.flatnonzero(~bounds.hold(wider.shapes))
+        if not outside.size:
             return wider
-    first = which[:1]
-    reference = fit_shapes(metric, first, start[None], bounds.low[first], bounds.high[first]).shapes
-    fits = fit_shapes(metric, which, np.repeat(reference, which.size, axis=0), bounds.low[which], bounds.high[which])
-    return fits if wider is None else wider.replaced(which, fits)
+        low, high = bounds.low[outside], bounds.high[outside]
+        return wider.replaced(outside, fit_shapes(metric, outside, wider.shapes[outside], low, high))
+    every = np.arange(len(bounds.low))
+    reference = fit_shapes(metric, every[:1], start[None], bounds.low[:1], bounds.high[:1]).shapes
+    return fit_shapes(metric, every, np.repeat(reference, every.size, axis=0), bounds.low, bounds.high)
 
 
 def _flagged(fits: Fits, shapes: FloatArray, fluxes: FloatArray, bounds: _Bounds) -> tuple[SersicFit | None, ...]:

@@ -1,7 +1,7 @@
 """Sersic profiles as functions of six shape parameters, with their derivatives, averaged over cells.
 
 The parameters are (ln r_eff, e1, e2, x, y, n), with e = (1 - q)/(1 + q) and (e1, e2) = e (cos 2 phi, sin 2 phi):
-nothing is singular where the profile is round. Brightness is for unit flux; the flux is linear, and solved for elsewhere.
+nothing is singular where the profile is round. Brightness is for unit flux; the flux is solved for elsewhere.
 
 A cell is a parallelogram. Far from the centre of the profile four points (2 x 2 Gauss-Legendre) give its mean; nearer
 it is cut into four, level by level, so that the cusp costs a few hundred points wherever it lies.
