@@ -135,13 +135,18 @@ def add_cell(
         scale = 0.5**depth
         size = size0 * scale
         dx, dy = px - c[6], py - c[7]
-        if depth >= _MAX_DEPTH or size < c[13] or dx * dx + dy * dy > (_CLEARANCE * size) ** 2:
+        near = dx * dx + dy * dy <= (_CLEARANCE * size) ** 2
+        if not near or depth >= _MAX_DEPTH or size < c[13]:
+            by_x, by_y = out[3], out[4]
             part = 0.25 * weight * scale * scale
             step = _GAUSS * scale
             for k in range(4):
                 s = step if k % 2 else -step
                 t = step if k // 2 else -step
                 add_point(px + s * ax + t * bx, py + s * ay + t * by, part, c, out)
+            if near:
+                # In the core the derivatives by the centre are odd and cancel; four points beside a pole do not.
+                out[3], out[4] = by_x, by_y
         else:
             half = 0.5 * scale
             for k in range(4):
