@@ -19,8 +19,9 @@ from engine.refits.aperture import aperture_flux
 from engine.refits.draws import DrawSet, SourceDraw, source_draw
 from engine.refits.estimators import Refit, SersicFit, refit_draws
 from engine.refits.image import ImageMetric, RayTracedModel
-from engine.refits.least_squares import fit_shapes
+from engine.refits.least_squares import fit_shapes, scatter
 from engine.refits.profiles import columns_on_grid, profile_of, profile_on_grid, shape_of
+from engine.refits.projected import ProjectedMetric
 from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import EstimatorName
 from engine.run import Truth, _refit
@@ -277,6 +278,25 @@ def test_the_projected_scatter_covers_the_noise(operator: Operator) -> None:
     # Scatter of the estimate from noise to noise against the spread that one data set reports: 40 of them, 11 %.
     assert np.std(fluxes) / np.mean(spreads) == pytest.approx(1.0, abs=0.35)
     assert np.mean(fluxes) == pytest.approx(50.0, rel=0.01)
+
+
+def test_scatter_at_a_fixed_shape_is_the_noise_of_the_flux_and_stays_inside_bounds_else() -> None:
+    draw = draw_of(on_grid(TRUTH), precision=0.01)
+    metric, which = ProjectedMetric([draw]), np.zeros(400, dtype=np.intp)
+    generators = [np.random.default_rng(seed) for seed in range(400)]
+    shape = np.repeat(shape_of(TRUTH)[None], 400, axis=0)
+    held = fit_shapes(metric, which, shape, shape, shape)
+    shapes, fluxes = scatter(metric, which, held, shape, shape, generators)
+    model = on_grid(TRUTH) / TRUTH.flux
+    assert np.array_equal(shapes, shape)
+    # 400 draws: 3.5 % of the deviation.
+    assert fluxes.std() == pytest.approx(1.0 / math.sqrt(0.01 * model @ model), rel=0.12)
+    low, high = (np.repeat(side[None], 400, axis=0) for side in draw.bounds((1.99, 4.0)))
+    fits = fit_shapes(metric, which, shape, low, high)
+    shapes, _ = scatter(metric, which, fits, low, high, generators)
+    assert (shapes >= low).all()
+    assert (shapes <= high).all()
+    assert shapes[:, 5].std() > 0.0
 
 
 def test_the_image_scatter_covers_the_noise() -> None:
