@@ -19,7 +19,7 @@ from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.foreign import NoiseFromImage, observation_from_arrays
 from engine.imaging.foreign_files import read_foreign_observation
 from engine.imaging.observation import Observation
-from engine.result import ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
+from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, measure, run
 from engine.scene import check_system
 from engine.seeds import generator
@@ -44,6 +44,7 @@ from engine.validation import field_steps, spec_error
 __all__ = [
     "STAGES",
     "Analysis",
+    "Aperture",
     "Camera",
     "CameraChoice",
     "ChainSummary",

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
 
-EstimatorName = Literal["paper", "projected"]
-IndexPrior = Literal["free", "fixed"]
+EstimatorName = Literal["paper", "covariance", "projected", "image"]
+IndexPrior = Literal["wide", "free", "fixed"]
+ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
+INDEX_PRIORS: tuple[IndexPrior, ...] = get_args(IndexPrior)
+INDEX_RANGES: dict[IndexPrior, tuple[float, float]] = {"wide": (0.3, 8.0), "free": (1.0, 4.0)}
+"""Flat priors of n; ``free`` is the paper's section 4.2, 'we constrain n to be in the range 1-4'."""
 ChainStatus = Literal["converged", "not_converged"]
 
 
@@ -31,21 +35,45 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Estimate:
-    """One estimator's answer: total magnitude, r_eff [arcsec], n, q, position angle [deg], over ``draws`` draws.
+    """One estimator's answer over ``draws`` draws.
 
-    ``at_bound`` counts the draws whose fit ended at a bound of a parameter; ``failed`` those whose fit did not
-    converge and which are left out of the means.
+    Total magnitude [AB], r_eff [arcsec, intermediate axis], n, q, position angle [deg], centre x, y [arcsec, source
+    plane in the image frame]; ``r_eff_galfit`` is GALFIT's radius, on the major axis: r_eff / sqrt(q).
+
+    ``at_bound`` counts the draws whose fit ended at a bound of n or of r_eff, ``n_at_bound`` and ``r_eff_at_bound``
+    those of each; ``failed`` counts those that could not be fitted and are left out of the means.
     """
 
     estimator: EstimatorName
     index_prior: IndexPrior
     magnitude: Quantity
     r_eff: Quantity
+    r_eff_galfit: Quantity
     n: Quantity
     q: Quantity
     position_angle: Quantity
+    x: Quantity
+    y: Quantity
     draws: int
     at_bound: int
+    n_at_bound: int
+    r_eff_at_bound: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class Aperture:
+    """AB magnitude of the drawn source maps within ``radius`` [arcsec] of the host's centre, without a profile.
+
+    The centre is that of the ``paper`` fit to the same map, n in the wide range. ``coverage`` is the share of the
+    circle that the source grid covers, in the mean: light beyond it is not seen. ``failed`` counts the draws without
+    a centre or without light.
+    """
+
+    radius: float
+    magnitude: Quantity
+    coverage: float
+    draws: int
     failed: int
 
 
@@ -62,7 +90,8 @@ class ChainSummary:
     """How well the posterior is sampled.
 
     ``tau`` is the integrated autocorrelation time in steps, largest over the parameters; ``effective_samples`` the
-    number of independent samples that it leaves.
+    number of independent samples that it leaves; ``r_hat`` the split R-hat (:mod:`engine.posterior.convergence`), None
+    where it was not computed.
     """
 
     status: ChainStatus
@@ -73,6 +102,7 @@ class ChainSummary:
     effective_samples: float
     acceptance: float
     evaluations: int
+    r_hat: float | None = None
 
 
 @dataclass(frozen=True)
@@ -114,6 +144,8 @@ class Products:
 class RunResult:
     """The outcome of one run.
 
+    ``profile`` names the analysis profile, None where the analysis was put together by hand. An estimator that could
+    not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
     ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.
     ``arc_magnitude`` is the AB magnitude of the lensed host in the image plane, ``agn_contrast`` AGN minus arc
     magnitude, ``surface_brightness`` the host's mean surface brightness inside r_eff [mag arcsec^-2] (the paper's
@@ -126,7 +158,9 @@ class RunResult:
     seed: int
     noise_level: str
     noise_treatment: str
+    regularisation: str
     estimates: tuple[Estimate, ...]
+    aperture: Aperture | None
     lens: tuple[LensParameter, ...]
     chain: ChainSummary
     ln_evidence: float
@@ -138,6 +172,7 @@ class RunResult:
     surface_brightness: float
     stages: tuple[StageTime, ...]
     warnings: tuple[str, ...] = ()
+    profile: str | None = None
     products: Products | None = field(default=None, repr=False, compare=False)
 
     def estimate(self, estimator: EstimatorName, index_prior: IndexPrior) -> Estimate:

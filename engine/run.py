@@ -16,10 +16,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from engine.conventions import rate_to_magnitude
+from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.imaging.observation import Observation
 from engine.inversion.evidence import Inversion
+from engine.inversion.mapping import SourceGrid
 from engine.inversion.problem import Problem, prepare_problem
 from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
@@ -28,11 +29,14 @@ from engine.modelling.parametric import fit_parametric
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Target, flat_prior
-from engine.refit import SourceDraw, fit_draws, profile_on_grid, summarise
+from engine.refits.draws import DrawSet, source_draw
+from engine.refits.estimators import refit_draws
+from engine.refits.profiles import profile_on_grid
+from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import (
+    ESTIMATORS,
+    Aperture,
     Estimate,
-    EstimatorName,
-    IndexPrior,
     LensParameter,
     Products,
     Quantity,
@@ -78,6 +82,7 @@ class Measurement:
     """What the analysis of an observation finds."""
 
     estimates: tuple[Estimate, ...]
+    aperture: Aperture | None
     lens: tuple[LensParameter, ...]
     chain: Chain
     best: Inversion
@@ -102,6 +107,10 @@ def _lens_parameters(target: Target, chain: Chain, truth: Truth | None) -> tuple
     return tuple(out)
 
 
+def _on_grid(host: SersicProfile, grid: SourceGrid) -> FloatArray:
+    return profile_on_grid(host, grid.x_edges, grid.y_edges).reshape(grid.shape)
+
+
 def _products(
     observation: Observation, problem: Problem, best: Inversion, target: Target, chain: Chain, truth: Truth | None
 ) -> tuple[Products, float]:
@@ -115,7 +124,6 @@ def _products(
     residual = np.zeros(observation.shape)
     fitted = mask & ~problem.core
     residual[fitted] = ((observation.image - model) / observation.noise)[fitted]
-    shape = best.grid.shape
     products = Products(
         image=observation.image,
         noise=observation.noise,
@@ -126,7 +134,7 @@ def _products(
         pixel_scale=observation.pixel_scale,
         source=best.source,
         source_sd=np.sqrt(best.source_variance()),
-        source_truth=None if truth is None else profile_on_grid(truth.host, best.grid).reshape(shape),
+        source_truth=None if truth is None else _on_grid(truth.host, best.grid),
         source_x_edges=best.grid.x_edges,
         source_y_edges=best.grid.y_edges,
         chain=chain.flat(),
@@ -136,22 +144,26 @@ def _products(
 
 
 def _refit(
-    draws: list[SourceDraw],
+    drawn: DrawSet,
     zero_point: float,
     truth: Truth | None,
     fixed_index: float | None,
     rng: np.random.Generator,
-) -> tuple[Estimate, ...]:
-    names: tuple[EstimatorName, ...] = ("paper", "projected")
-    priors: list[tuple[IndexPrior, float | None]] = [("free", None)]
-    if fixed_index is not None:
-        priors.append(("fixed", fixed_index))
-    out = []
-    for name in names:
-        for prior, index in priors:
-            fits, failed = fit_draws(draws, name, index, rng)
-            out.append(summarise(fits, failed, name, prior, zero_point, truth.host if truth else None))
-    return tuple(out)
+) -> tuple[tuple[Estimate, ...], Aperture | None, list[str]]:
+    """Estimates, aperture magnitude, and a warning for each of them that is not there."""
+    host = truth.host if truth else None
+    refits = refit_draws(drawn, ESTIMATORS, fixed_index, rng)
+    summaries = [summarise(refit, zero_point, host) for refit in refits]
+    warnings = [
+        f"{refit.estimator} estimator, n {refit.index_prior}: not one of {len(refit.fits)} draws could be fitted"
+        for refit, summary in zip(refits, summaries, strict=True)
+        if summary is None
+    ]
+    on_maps = next(refit for refit in refits if (refit.estimator, refit.index_prior) == ("paper", "wide"))
+    aperture = summarise_aperture(drawn.draws, on_maps, zero_point, host)
+    if aperture is None:
+        warnings.append("aperture: no drawn source has light within it")
+    return tuple(summary for summary in summaries if summary is not None), aperture, warnings
 
 
 def measure(
@@ -215,16 +227,14 @@ def measure(
             progress=None if report is None else lambda done: report("chain", done),
         )
     with watch.stage("draws"):
-        draws = []
-        for state in chain.thinned(analysis.draws, rng):
-            inversion = target.invert(state)
-            draws.append(SourceDraw(inversion, inversion.draw_source(rng)))
+        states = chain.thinned(analysis.draws, rng)
+        draws = [source_draw(target.invert(state), target.lens(state), rng) for state in states]
         flat_ln = chain.ln_posterior.ravel()
         best = target.invert(chain.flat()[int(np.argmax(flat_ln))])
         products, chi2 = _products(observation, problem, best, target, chain, truth)
     with watch.stage("refit"):
-        estimates = _refit(draws, observation.zero_point, truth, fixed_index, rng)
-    warnings = []
+        drawn = DrawSet(problem.operator, tuple(draws))
+        estimates, aperture, warnings = _refit(drawn, observation.zero_point, truth, fixed_index, rng)
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
@@ -235,6 +245,7 @@ def measure(
     fitted = int((problem.mask & ~problem.core).sum())
     return Measurement(
         estimates=estimates,
+        aperture=aperture,
         lens=_lens_parameters(target, chain, truth),
         chain=chain,
         best=best,
@@ -295,7 +306,9 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
         seed=realization.seed,
         noise_level=noise.level,
         noise_treatment=realization.analysis.noise_treatment,
+        regularisation=realization.analysis.regularisation,
         estimates=found.estimates,
+        aperture=found.aperture,
         lens=found.lens,
         chain=found.chain.summary,
         ln_evidence=found.ln_evidence,

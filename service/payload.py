@@ -13,15 +13,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 if TYPE_CHECKING:
-    from engine import Estimate, Quantity, RunResult
+    from engine import Aperture, Estimate, Quantity, RunResult
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Text = Annotated[str, Field(max_length=2000)]
-EstimateName = Literal["paper_free", "paper_fixed", "projected_free", "projected_fixed"]
+EstimateName = Literal[
+    "paper_wide", "paper_free", "paper_fixed",
+    "covariance_wide", "covariance_free", "covariance_fixed",
+    "projected_wide", "projected_free", "projected_fixed",
+    "image_wide", "image_free", "image_fixed",
+]  # fmt: skip
 ESTIMATES: tuple[EstimateName, ...] = get_args(EstimateName)
-QUANTITIES = ("magnitude", "r_eff", "n", "q", "position_angle")
+"""Estimator and prior of n: wide 0.3-8, free 1-4, fixed to the truth."""
+QUANTITIES = ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y")
+COUNTS = ("draws", "at_bound", "n_at_bound", "r_eff_at_bound", "failed")
 LENS_PARAMETERS = ("theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda")
 
 
@@ -47,15 +54,30 @@ class QuantityPayload(_Strict):
 
 
 class EstimatePayload(_Strict):
-    """What one estimator recovered: magnitude [AB], r_eff [arcsec], n, q, position angle [deg]."""
+    """What one estimator recovered: magnitude [AB], r_eff and GALFIT's [arcsec], n, q, position angle [deg], centre."""
 
     magnitude: QuantityPayload
     r_eff: QuantityPayload
+    r_eff_galfit: QuantityPayload
     n: QuantityPayload
     q: QuantityPayload
     position_angle: QuantityPayload
+    x: QuantityPayload
+    y: QuantityPayload
     draws: Annotated[int, Field(ge=1)]
     at_bound: Annotated[int, Field(ge=0)]
+    n_at_bound: Annotated[int, Field(ge=0)]
+    r_eff_at_bound: Annotated[int, Field(ge=0)]
+    failed: Annotated[int, Field(ge=0)]
+
+
+class AperturePayload(_Strict):
+    """Magnitude of the source maps within ``radius`` [arcsec]; ``coverage`` of the circle is on the source grid."""
+
+    radius: NonNegative
+    magnitude: QuantityPayload
+    coverage: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+    draws: Annotated[int, Field(ge=1)]
     failed: Annotated[int, Field(ge=0)]
 
 
@@ -70,6 +92,7 @@ class ChainPayload(_Strict):
     effective_samples: NonNegative
     acceptance: NonNegative
     evaluations: Annotated[int, Field(ge=0)]
+    r_hat: NonNegative | None = None
 
 
 class StagePayload(_Strict):
@@ -88,13 +111,19 @@ class ArtefactPayload(_Strict):
 
 
 class ResultPayload(_Strict):
-    """Everything that is stored of one run."""
+    """Everything that is stored of one run.
+
+    Every estimate is named; one that could fit no draw is null.
+    """
 
     realization_digest: Digest
     engine_digest: Digest
     versions: dict[str, Text]
     noise_treatment: Annotated[str, Field(max_length=32)]
-    estimates: dict[EstimateName, EstimatePayload]
+    regularisation: Annotated[str, Field(max_length=32)]
+    profile: Annotated[str, Field(max_length=32)] | None = None
+    estimates: dict[EstimateName, EstimatePayload | None]
+    aperture: AperturePayload | None
     lens: dict[str, QuantityPayload]
     chain: ChainPayload
     ln_evidence: Finite
@@ -149,13 +178,17 @@ def result_payload(
     InvalidResultError
         A number is not finite or a part is missing; the message names the first.
     """
+    found = {f"{e.estimator}_{e.index_prior}": _estimate(e) for e in result.estimates}
     return read_payload(
         {
             "realization_digest": result.realization_digest,
             "engine_digest": result.engine_digest,
             "versions": dict(result.versions),
             "noise_treatment": result.noise_treatment,
-            "estimates": {f"{e.estimator}_{e.index_prior}": _estimate(e) for e in result.estimates},
+            "regularisation": result.regularisation,
+            "profile": result.profile,
+            "estimates": {name: found.get(name) for name in ESTIMATES} | found,
+            "aperture": None if result.aperture is None else _aperture(result.aperture),
             "lens": {parameter.name: _quantity(parameter.value) for parameter in result.lens},
             "chain": {name: _plain(getattr(result.chain, name)) for name in ChainPayload.model_fields},
             "ln_evidence": float(result.ln_evidence),
@@ -185,7 +218,17 @@ def read_payload(document: object) -> ResultPayload:
 
 def _estimate(estimate: Estimate) -> dict[str, Any]:
     quantities = {name: _quantity(getattr(estimate, name)) for name in QUANTITIES}
-    return {**quantities, "draws": estimate.draws, "at_bound": estimate.at_bound, "failed": estimate.failed}
+    return {**quantities, **{name: int(getattr(estimate, name)) for name in COUNTS}}
+
+
+def _aperture(aperture: Aperture) -> dict[str, Any]:
+    return {
+        "radius": float(aperture.radius),
+        "magnitude": _quantity(aperture.magnitude),
+        "coverage": float(aperture.coverage),
+        "draws": aperture.draws,
+        "failed": aperture.failed,
+    }
 
 
 def _quantity(quantity: Quantity) -> dict[str, Any]:

@@ -151,11 +151,30 @@ class EstimateView(_Answer):
 
     magnitude: Recovered
     r_eff: Recovered
+    """Half-light radius on the intermediate axis [arcsec]."""
+    r_eff_galfit: Recovered | None
+    """The same on the major axis, GALFIT's convention; null in results that are older than this field."""
     n: Recovered
     q: Recovered
     position_angle: Recovered
+    x: Recovered | None
+    """Centre in the source plane [arcsec]; null in older results."""
+    y: Recovered | None
     draws: int
     at_bound: int
+    """Draws whose fit ended at a bound of n or of r_eff."""
+    n_at_bound: int | None
+    r_eff_at_bound: int | None
+    failed: int
+
+
+class ApertureView(_Answer):
+    """Magnitude of the reconstructed source within ``radius`` arcsec; ``coverage`` of the circle is on its grid."""
+
+    radius: float
+    magnitude: Recovered
+    coverage: float
+    draws: int
     failed: int
 
 
@@ -170,7 +189,11 @@ class LensValue(_Answer):
 class ResultView(_Answer):
     """Everything that was stored of a run."""
 
-    estimates: dict[EstimateName, EstimateView]
+    estimates: dict[EstimateName, EstimateView | None]
+    """Null where an estimator could fit no draw, and where the result is older than the estimator."""
+    aperture: ApertureView | None
+    regularisation: str | None
+    profile: str | None
     lens: dict[str, LensValue]
     chain: ChainPayload
     ln_evidence: float
@@ -252,13 +275,12 @@ class SummaryValue(_Answer):
 
 
 class SummaryEstimate(_Answer):
-    """One estimator over the runs of one input."""
+    """One estimator over those runs of one input that have its answer."""
 
     magnitude: SummaryValue
     r_eff: SummaryValue
     n: SummaryValue
-    q: SummaryValue
-    position_angle: SummaryValue
+    runs: int
     at_bound: int
     failed: int
 
@@ -268,7 +290,7 @@ class SummaryRow(_Answer):
 
     input: dict[str, Any]
     n_runs: int
-    estimates: dict[EstimateName, SummaryEstimate]
+    estimates: dict[EstimateName, SummaryEstimate | None]
 
 
 class OverallValue(_Answer):
@@ -280,13 +302,12 @@ class OverallValue(_Answer):
 
 
 class OverallEstimate(_Answer):
-    """One estimator over all stored runs of a grid."""
+    """One estimator over those stored runs of a grid that have its answer."""
 
     magnitude: OverallValue
     r_eff: OverallValue
     n: OverallValue
-    q: OverallValue
-    position_angle: OverallValue
+    runs: int
 
 
 class Summary(_Answer):
@@ -297,7 +318,7 @@ class Summary(_Answer):
     n_runs: int
     n_stored: int
     rows: list[SummaryRow]
-    overall: dict[EstimateName, OverallEstimate]
+    overall: dict[EstimateName, OverallEstimate | None]
     next: str | None
 
 

@@ -15,11 +15,13 @@ ROWS: tuple[tuple[EstimateName, str, str], ...] = (
     ("paper_fixed", "magnitude", "magnitude, n fixed"),
     ("paper_free", "r_eff", "R_eff"),
     ("paper_free", "n", "n"),
+    ("covariance_free", "magnitude", "magnitude (covariance)"),
     ("projected_free", "magnitude", "magnitude (projected)"),
-    ("projected_free", "r_eff", "R_eff (projected)"),
-    ("projected_free", "n", "n (projected)"),
+    ("image_wide", "magnitude", "magnitude (image)"),
+    ("image_wide", "r_eff", "R_eff (image)"),
+    ("image_wide", "n", "n (image)"),
 )
-"""What is shown of each input: by the estimator ``paper`` where nothing is said."""
+"""What is shown of each input: by ``paper`` with n in 1-4 where nothing is said, by ``image`` with n in 0.3-8."""
 
 
 def value_of(estimate: SummaryEstimate, quantity: str) -> SummaryValue:
@@ -42,11 +44,17 @@ def summary_table(summary: Summary) -> Table:
         named += [f"{title} = {row.input[name]:g}" for name, title in _INPUT]
         named += [""] * (len(ROWS) - len(named))
         for place, (cell, (estimate, quantity, title)) in enumerate(zip(named, ROWS, strict=True)):
-            value = value_of(row.estimates[estimate], quantity)
-            true, bias = _number(value.input, "{:g}"), _number(value.bias, "{:+.3f}")
             last = place == len(ROWS) - 1
+            found = row.estimates[estimate]
+            if found is None:
+                table.add_row(cell, title, "", "no estimate", "", end_section=last)
+                continue
+            value = value_of(found, quantity)
+            true, bias = _number(value.input, "{:g}"), _number(value.bias, "{:+.3f}")
             table.add_row(cell, title, true, f"{value.mean:.3f} ± {value.sd:.3f}", bias, end_section=last)
-    table.caption = "bias: recovered minus true; sd: spread of the draws of a run"
+    table.caption = (
+        "bias: recovered minus true; sd: spread of the draws of a run; n in 0.3-8 for image, else in 1-4 or fixed"
+    )
     return table
 
 

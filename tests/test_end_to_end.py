@@ -44,6 +44,7 @@ def test_a_grid_of_the_paper_survives_a_kill_and_its_biases_are_those_of_the_eng
     row = next(row for row in summary.rows if (row.input["n"], row.input["magnitude"]) == (2.0, 20.5))
     for estimate in direct.estimates:
         stored = row.estimates[f"{estimate.estimator}_{estimate.index_prior}"]
+        assert stored is not None
         for name in ("magnitude", "r_eff", "n"):
             found, expected = getattr(stored, name), getattr(estimate, name)
             assert (found.mean, found.sd, found.bias) == (expected.mean, expected.sd, expected.bias)

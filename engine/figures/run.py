@@ -76,10 +76,13 @@ def run_figure(result: RunResult) -> Figure:
     for panel in axes.flat:
         panel.set_xlabel("arcsec (West)", fontsize=7)
         panel.set_ylabel("arcsec (North)", fontsize=7)
-    free = result.estimate("paper", "free")
+    host = "no estimate"
+    for found in result.estimates:
+        if (found.estimator, found.index_prior) == ("paper", "free"):
+            host = f"{found.magnitude.mean:.2f} +- {found.magnitude.sd:.2f} mag"
     figure.suptitle(
         f"run {result.realization_digest[:12]}   chi$^2$/dof {result.chi2 / result.degrees_of_freedom:.2f}   "
-        f"host {free.magnitude.mean:.2f} +- {free.magnitude.sd:.2f} mag (paper estimator)   "
+        f"host {host} (paper estimator)   "
         f"chain {result.chain.status.replace('_', ' ')}",
         fontsize=10,
     )

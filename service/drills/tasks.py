@@ -45,11 +45,16 @@ def payload_of(realization: Realization) -> dict[str, Any]:
         return {
             "magnitude": quantity(host.magnitude, 0.1),
             "r_eff": quantity(host.r_eff, 0.03),
+            "r_eff_galfit": quantity(host.r_eff / (host.q or 0.8) ** 0.5, 0.04),
             "n": quantity(host.n, 0.3),
             "q": quantity(host.q or 0.8, 0.05),
             "position_angle": quantity(host.position_angle or 30.0, 4.0),
+            "x": quantity(0.01, 0.001),
+            "y": quantity(-0.02, 0.001),
             "draws": 30,
-            "at_bound": 2,
+            "at_bound": 3,
+            "n_at_bound": 2,
+            "r_eff_at_bound": 1,
             "failed": 0,
         }
 
@@ -58,11 +63,16 @@ def payload_of(realization: Realization) -> dict[str, Any]:
         "engine_digest": hashlib.sha256(b"no engine").hexdigest(),
         "versions": {"tasks": "1"},
         "noise_treatment": realization.analysis.noise_treatment,
+        "regularisation": realization.analysis.regularisation,
         "estimates": {name: estimate() for name in ESTIMATES},
+        "aperture": {
+            "radius": 1.0, "magnitude": quantity(host.magnitude + 0.1, 0.05), "coverage": 0.9, "draws": 30, "failed": 0,
+        },
         "lens": {"theta_E": quantity(1.2, 0.01), "slope": quantity(2.0, 0.05), "ln_lambda": {"mean": 2.0, "sd": 0.3}},
         "chain": {
             "status": "converged", "walkers": 24, "steps": 400, "burn_in": 100,
             "tau": 31.5, "effective_samples": 228.0, "acceptance": 0.41, "evaluations": 9600,
+            "r_hat": 1.004,
         },
         "ln_evidence": -5123.25,
         "chi2": 4980.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from service.payload import QUANTITIES, ResultPayload
+from service.payload import COUNTS, ESTIMATES, QUANTITIES, AperturePayload, EstimatePayload, ResultPayload
 from service.store.leases import Lease
 from service.store.tables import INPUT_COLUMNS
 
@@ -14,12 +14,9 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
     """Typed columns of a result; ``inputs`` are those of the run."""
     row: dict[str, Any] = {"run_id": lease.run_id, "grid_id": lease.grid_id, "stored_at": now}
     row |= {name: inputs[name] for name in INPUT_COLUMNS}
-    for estimate, found in payload.estimates.items():
-        for quantity in QUANTITIES:
-            value = getattr(found, quantity)
-            prefix = f"{estimate}_{quantity}"
-            row |= {f"{prefix}_mean": value.mean, f"{prefix}_sd": value.sd, f"{prefix}_bias": value.bias}
-        row |= {f"{estimate}_{part}": getattr(found, part) for part in ("draws", "at_bound", "failed")}
+    for estimate in ESTIMATES:
+        row |= _estimate_columns(estimate, payload.estimates[estimate])
+    row |= _aperture_columns(payload.aperture)
     for name, value in payload.lens.items():
         prefix = f"lens_{name.lower()}"
         row |= {f"{prefix}_mean": value.mean, f"{prefix}_sd": value.sd, f"{prefix}_truth": value.truth}
@@ -28,6 +25,7 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
     plain = (
         "ln_evidence", "chi2", "degrees_of_freedom", "condition_number",
         "arc_magnitude", "agn_contrast", "surface_brightness", "wall_s", "cpu_s", "engine_digest",
+        "regularisation", "profile",
     )  # fmt: skip
     row |= {name: getattr(payload, name) for name in plain}
     row |= {
@@ -41,4 +39,24 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
         "products": payload.products and payload.products.key,
         "products_digest": payload.products and payload.products.digest,
     }
+    return row
+
+
+def _estimate_columns(estimate: str, found: EstimatePayload | None) -> dict[str, Any]:
+    """Columns of one estimate, every one of them null where there is none."""
+    row: dict[str, Any] = {}
+    for quantity in QUANTITIES:
+        value = None if found is None else getattr(found, quantity)
+        for part in ("mean", "sd", "bias"):
+            row[f"{estimate}_{quantity}_{part}"] = None if value is None else getattr(value, part)
+    for part in COUNTS:
+        row[f"{estimate}_{part}"] = None if found is None else getattr(found, part)
+    return row
+
+
+def _aperture_columns(found: AperturePayload | None) -> dict[str, Any]:
+    names = ("radius", "coverage", "draws", "failed")
+    row = {f"aperture_{name}": None if found is None else getattr(found, name) for name in names}
+    for part in ("mean", "sd", "bias"):
+        row[f"aperture_magnitude_{part}"] = None if found is None else getattr(found.magnitude, part)
     return row

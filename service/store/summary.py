@@ -7,7 +7,7 @@ from typing import Any
 
 from sqlalchemy import Row, RowMapping, select
 
-from service.payload import ESTIMATES, QUANTITIES
+from service.payload import ESTIMATES
 from service.schemas import (
     GridView,
     OverallEstimate,
@@ -15,7 +15,7 @@ from service.schemas import (
     Summary,
 )
 from service.store.database import Database
-from service.store.tables import COUNTED, GROUP_COLUMNS, INPUT_COLUMNS, grid_sum, input_sum
+from service.store.tables import COUNTED, GROUP_COLUMNS, INPUT_COLUMNS, SUMMED, grid_sum, input_sum
 
 _INPUTS = frozenset(INPUT_COLUMNS)
 
@@ -55,15 +55,18 @@ def _places(estimate: str, quantity: str) -> tuple[int | None, tuple[int, ...]]:
     )
 
 
-_QUANTITIES = {name: {quantity: _places(name, quantity) for quantity in QUANTITIES} for name in ESTIMATES}
+_QUANTITIES = {name: {quantity: _places(name, quantity) for quantity in SUMMED} for name in ESTIMATES}
 
 
 def _row(row: tuple[Any, ...]) -> dict[str, Any]:
     """A :class:`SummaryRow` as plain data."""
-    runs = row[_AT["runs"]]
-    estimates = {}
+    estimates: dict[str, dict[str, Any] | None] = {}
     for name, quantities in _QUANTITIES.items():
         estimate: dict[str, Any] = {part: row[_AT[f"{name}_{part}"]] for part in COUNTED}
+        runs = estimate["runs"]
+        if not runs:
+            estimates[name] = None
+            continue
         for quantity, (place, sums) in quantities.items():
             true = None if place is None else row[place]
             total, squares, sd, bias, bias_runs = (row[at] for at in sums)
@@ -76,18 +79,25 @@ def _row(row: tuple[Any, ...]) -> dict[str, Any]:
                 "bias": bias / bias_runs if bias_runs else None,
             }
         estimates[name] = estimate
-    return {"input": {name: row[_AT[name]] for name in GROUP_COLUMNS}, "n_runs": runs, "estimates": estimates}
+    return {
+        "input": {name: row[_AT[name]] for name in GROUP_COLUMNS},
+        "n_runs": row[_AT["runs"]],
+        "estimates": estimates,
+    }
 
 
-def _overall(row: Row[*tuple[Any, ...]], estimate: str) -> OverallEstimate:
+def _overall(row: Row[*tuple[Any, ...]], estimate: str) -> OverallEstimate | None:
     column = row._mapping
+    runs = column[f"{estimate}_runs"]
+    if not runs:
+        return None
     values = {}
-    for quantity in QUANTITIES:
+    for quantity in SUMMED:
         name = f"{estimate}_{quantity}"
         bias, square = (_mean(column, f"{name}_{part}", f"{name}_bias_runs") for part in ("bias", "bias2"))
         spread = None if bias is None or square is None else _scatter(bias, square, column[f"{name}_bias_runs"])
-        values[quantity] = OverallValue(bias=bias, bias_scatter=spread, sd=column[f"{name}_sd"] / row.runs)
-    return OverallEstimate(**values)
+        values[quantity] = OverallValue(bias=bias, bias_scatter=spread, sd=column[f"{name}_sd"] / runs)
+    return OverallEstimate(runs=runs, **values)
 
 
 def _mean(column: RowMapping, total: str, runs: str) -> float | None:

@@ -13,8 +13,8 @@ from typing import Any
 from sqlalchemy import Connection, Insert, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.payload import ESTIMATES, QUANTITIES
-from service.store.tables import COUNTED, GROUP_COLUMNS, grid_sum, input_sum
+from service.payload import ESTIMATES
+from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_sum, input_sum
 
 _INSERT: dict[str, Callable[[Table], sqlite.Insert | postgresql.Insert]] = {
     "sqlite": sqlite.insert,
@@ -40,10 +40,12 @@ def add_to_sums(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
 def _add(sums: dict[str, Any], row: dict[str, Any], parts: tuple[str, ...]) -> None:
     sums["runs"] = sums.get("runs", 0) + 1
     for estimate in ESTIMATES:
+        answered = row[f"{estimate}_magnitude_mean"] is not None
         for name in COUNTED:
             column = f"{estimate}_{name}"
-            sums[column] = sums.get(column, 0) + row[column]
-        for quantity in QUANTITIES:
+            added = 0 if not answered else 1 if name == "runs" else row[column]
+            sums[column] = sums.get(column, 0) + added
+        for quantity in SUMMED:
             prefix = f"{estimate}_{quantity}"
             for part, value in zip(parts, _moments(row, prefix, quantity, parts), strict=True):
                 column = f"{prefix}_{part}"
@@ -51,8 +53,11 @@ def _add(sums: dict[str, Any], row: dict[str, Any], parts: tuple[str, ...]) -> N
 
 
 def _moments(row: dict[str, Any], prefix: str, quantity: str, parts: tuple[str, ...]) -> Iterator[float]:
+    mean = row[f"{prefix}_mean"]
+    if mean is None:
+        return iter([0] * len(parts))
     bias = row[f"{prefix}_bias"]
-    shift = row[f"{prefix}_mean"] - (row[quantity] if quantity in GROUP_COLUMNS else 0.0)
+    shift = mean - (row[quantity] if quantity in GROUP_COLUMNS else 0.0)
     known = {
         "sd": row[f"{prefix}_sd"],
         "bias": 0.0 if bias is None else bias,

@@ -28,7 +28,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.payload import ESTIMATES, LENS_PARAMETERS, QUANTITIES
+from service.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
 
 metadata = MetaData(
     naming_convention={
@@ -173,12 +173,12 @@ def _input_columns() -> list[Column[Any]]:
 
 
 def _estimate_columns() -> list[Column[Any]]:
+    # All null where an estimator has no answer; new quantities are null in results that are older than they.
     columns: list[Column[Any]] = []
     for estimate in ESTIMATES:
         for quantity in QUANTITIES:
-            columns += [Column(f"{estimate}_{quantity}_{part}", Float, nullable=False) for part in ("mean", "sd")]
-            columns.append(Column(f"{estimate}_{quantity}_bias", Float))
-        columns += [Column(f"{estimate}_{part}", Integer, nullable=False) for part in ("draws", "at_bound", "failed")]
+            columns += [Column(f"{estimate}_{quantity}_{part}", Float) for part in ("mean", "sd", "bias")]
+        columns += [Column(f"{estimate}_{part}", Integer) for part in COUNTS]
     return columns
 
 
@@ -197,6 +197,15 @@ result = Table(
     *_input_columns(),
     *_estimate_columns(),
     *_lens_columns(),
+    # Null in results that are older than these columns; the aperture also where no map has light in it.
+    Column("aperture_radius", Float),
+    *(Column(f"aperture_magnitude_{part}", Float) for part in ("mean", "sd", "bias")),
+    Column("aperture_coverage", Float),
+    Column("aperture_draws", Integer),
+    Column("aperture_failed", Integer),
+    Column("regularisation", String(32)),
+    Column("profile", String(32)),
+    Column("r_hat", Float),
     Column("ln_evidence", Float, nullable=False),
     Column("chi2", Float, nullable=False),
     Column("degrees_of_freedom", Integer, nullable=False),
@@ -227,14 +236,17 @@ result = Table(
 
 GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
 """Runs that agree in these are runs of one input."""
-COUNTED = ("at_bound", "failed")
+COUNTED = ("runs", "at_bound", "failed")
+"""Runs with an answer of the estimator, and draws of those runs."""
+SUMMED = ("magnitude", "r_eff", "n")
+"""What a summary shows; the other quantities stand with each result."""
 
 
 def _sum_columns(parts: tuple[str, ...]) -> list[Column[Any]]:
     columns: list[Column[Any]] = [Column("runs", Integer, nullable=False)]
     for estimate in ESTIMATES:
         columns += [Column(f"{estimate}_{name}", BigInteger, nullable=False) for name in COUNTED]
-        for quantity in QUANTITIES:
+        for quantity in SUMMED:
             columns += [
                 Column(f"{estimate}_{quantity}_{part}", Integer if part == "bias_runs" else Float, nullable=False)
                 for part in parts

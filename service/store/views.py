@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Row
+from sqlalchemy import Row, RowMapping
 
-from service.payload import ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload
+from service.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload
 from service.schemas import (
     UWS_PHASES,
+    ApertureView,
     AttemptView,
     EstimateView,
     GridView,
@@ -123,16 +124,7 @@ def run_detail(row: Row[Any], found: Row[Any] | None, attempts: Sequence[Row[Any
 def result_view(row: Row[Any]) -> ResultView:
     """A result, its columns gathered by estimator and lens parameter."""
     column = row._mapping
-    estimates = {
-        name: EstimateView(
-            **{
-                quantity: Recovered(**{part: column[f"{name}_{quantity}_{part}"] for part in ("mean", "sd", "bias")})
-                for quantity in QUANTITIES
-            },
-            **{part: column[f"{name}_{part}"] for part in ("draws", "at_bound", "failed")},
-        )
-        for name in ESTIMATES
-    }
+    estimates = {name: _estimate_view(column, name) for name in ESTIMATES}
     lens = {
         name: LensValue(**{part: column[f"lens_{name.lower()}_{part}"] for part in ("mean", "sd", "truth")})
         for name in LENS_PARAMETERS
@@ -142,8 +134,33 @@ def result_view(row: Row[Any]) -> ResultView:
         status=column["chain_status"],
         **{name: column[name] for name in ChainPayload.model_fields if name != "status"},
     )
-    plain = [name for name in ResultView.model_fields if name not in {"estimates", "lens", "chain"}]
-    return ResultView(estimates=estimates, lens=lens, chain=chain, **{name: column[name] for name in plain})
+    plain = [name for name in ResultView.model_fields if name not in {"estimates", "aperture", "lens", "chain"}]
+    aperture = _aperture_view(column)
+    return ResultView(
+        estimates=estimates, aperture=aperture, lens=lens, chain=chain, **{name: column[name] for name in plain}
+    )
+
+
+def _recovered(column: RowMapping, prefix: str) -> Recovered | None:
+    if column[f"{prefix}_mean"] is None:
+        return None
+    return Recovered(**{part: column[f"{prefix}_{part}"] for part in ("mean", "sd", "bias")})
+
+
+def _estimate_view(column: RowMapping, name: str) -> EstimateView | None:
+    """An estimate; None where the result has none, which shows in its magnitude."""
+    if column[f"{name}_magnitude_mean"] is None:
+        return None
+    quantities = {quantity: _recovered(column, f"{name}_{quantity}") for quantity in QUANTITIES}
+    return EstimateView.model_validate(quantities | {part: column[f"{name}_{part}"] for part in COUNTS})
+
+
+def _aperture_view(column: RowMapping) -> ApertureView | None:
+    magnitude = _recovered(column, "aperture_magnitude")
+    if magnitude is None:
+        return None
+    plain = {name: column[f"aperture_{name}"] for name in ("radius", "coverage", "draws", "failed")}
+    return ApertureView(magnitude=magnitude, **plain)
 
 
 def _run_fields(row: Row[Any]) -> dict[str, Any]:

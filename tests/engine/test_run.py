@@ -9,6 +9,7 @@ import pytest
 
 from engine import STAGES, Analysis, Host, Realization, RunResult, SpecError, generator, load_system, measure, run
 from engine.figures import run_figure
+from engine.result import ESTIMATORS, INDEX_PRIORS
 from engine.simulation import Simulation
 
 
@@ -18,14 +19,11 @@ def result(realization: Realization) -> RunResult:
 
 
 def test_a_run_reports_everything_finite(result: RunResult) -> None:
-    assert [(e.estimator, e.index_prior) for e in result.estimates] == [
-        ("paper", "free"),
-        ("paper", "fixed"),
-        ("projected", "free"),
-        ("projected", "fixed"),
-    ]
+    answered = [(e.estimator, e.index_prior) for e in result.estimates]
+    assert answered == [(estimator, prior) for estimator in ESTIMATORS for prior in INDEX_PRIORS]
     for estimate in result.estimates:
-        for quantity in (estimate.magnitude, estimate.r_eff, estimate.n, estimate.q, estimate.position_angle):
+        for name in ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y"):
+            quantity = getattr(estimate, name)
             assert math.isfinite(quantity.mean)
             assert math.isfinite(quantity.sd)
             assert quantity.bias is not None
@@ -33,6 +31,9 @@ def test_a_run_reports_everything_finite(result: RunResult) -> None:
     assert result.estimate("paper", "fixed").n.bias == 0.0
     assert [p.name for p in result.lens] == ["theta_E", "q", "phi", "slope", "x", "y", "ln_lambda"]
     assert [stage.stage for stage in result.stages] == list(STAGES)
+    assert result.aperture is not None
+    assert math.isfinite(result.aperture.magnitude.mean)
+    assert (result.regularisation, result.noise_treatment, result.profile) == ("curvature", "diagonal", None)
     for number in (result.ln_evidence, result.chi2, result.condition_number, result.arc_magnitude):
         assert math.isfinite(number)
     assert result.chain.evaluations > 100
@@ -55,6 +56,8 @@ def test_even_a_coarse_reconstruction_finds_the_host(result: RunResult) -> None:
     # 12 x 12 source pixels and ten steps: the estimators are within half a magnitude nonetheless.
     assert abs(result.estimate("projected", "free").magnitude.bias or 9.0) < 0.5
     assert abs(result.estimate("paper", "free").magnitude.bias or 9.0) < 0.7
+    # No grid to be coarse: what is left is the lens that the coarse grid finds.
+    assert abs(result.estimate("image", "wide").magnitude.bias or 9.0) < 0.15
 
 
 def test_the_same_realization_gives_the_same_bits(realization: Realization, result: RunResult) -> None:
@@ -91,7 +94,8 @@ def test_progress_names_the_stages_in_order(realization: Realization) -> None:
 
 def test_an_observation_without_a_truth_has_no_bias(simulation: Simulation, realization: Realization) -> None:
     found = measure(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
-    assert [(e.estimator, e.index_prior) for e in found.estimates] == [("paper", "free"), ("projected", "free")]
+    answered = [(e.estimator, e.index_prior) for e in found.estimates]
+    assert answered == [(estimator, prior) for estimator in ESTIMATORS for prior in ("wide", "free")]
     assert all(estimate.magnitude.bias is None for estimate in found.estimates)
     assert all(parameter.value.truth is None for parameter in found.lens)
 

@@ -218,6 +218,49 @@ def test_paused_runs_wait_in_the_queue_of_a_code_that_knows_no_pause(empties: Em
     assert (again.counts.done, again.counts.queued, again.state) == (1, 1, "running")
 
 
+def test_what_older_results_did_not_hold_is_null_after_the_upgrade(empties: Empties, lived: history.Rows) -> None:
+    url = empties()
+    upgrade(url, "0003")
+    database = Database(url, pooled=False)
+    with database.write() as connection:
+        history.write(connection, lived)
+    upgrade(url)
+    grids = GridStore(database)
+    details = [grids.run(row["run_id"]).result for row in lived["result"]]
+    for found in details:
+        assert found is not None
+        present = {name for name, estimate in found.estimates.items() if estimate is not None}
+        assert present == {"paper_free", "paper_fixed", "projected_free", "projected_fixed"}
+        old = found.estimates["paper_free"]
+        assert old is not None
+        assert (old.r_eff_galfit, old.x, old.y, old.n_at_bound, old.r_eff_at_bound) == (None,) * 5
+        assert (found.aperture, found.chain.r_hat, found.profile) == (None, None, None)
+        assert found.regularisation == "curvature"
+
+
+def test_results_that_an_older_revision_cannot_hold_stop_the_downgrade(empties: Empties) -> None:
+    url = empties()
+    upgrade(url)
+    database = Database(url, pooled=False)
+    grids, queue = GridStore(database), RunQueue(database)
+    submit(grids, 1)
+    generation = Leadership(database).take("test")
+    assert generation == 1
+    (lease,) = queue.claim(generation, 1)
+    payload = result_of(lease)
+    lacking = payload.model_copy(update={"estimates": {**payload.estimates, "paper_fixed": None}, "aperture": None})
+    assert queue.store(lease, lacking) is Stored.STORED
+    shown = grids.run(lease.run_id).result
+    assert shown is not None
+    assert shown.estimates["paper_fixed"] is None
+    assert shown.aperture is None
+    assert shown.estimates["image_wide"] is not None
+    with pytest.raises(MigrationError, match="1 results lack an estimate"):
+        downgrade(url, "0003")
+    assert current(url) == revisions()[-1]
+    assert grids.run(lease.run_id).result == shown
+
+
 def test_processes_that_upgrade_at_once_take_turns(empties: Empties) -> None:
     url = empties()
     command = [sys.executable, "-c", f"from service.store.migrate import upgrade; upgrade({url!r})"]

@@ -17,7 +17,17 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 import engine.figures
-from engine.result import ChainSummary, Estimate, LensParameter, Quantity, RunResult, StageTime
+from engine.result import (
+    ESTIMATORS,
+    INDEX_PRIORS,
+    Aperture,
+    ChainSummary,
+    Estimate,
+    LensParameter,
+    Quantity,
+    RunResult,
+    StageTime,
+)
 from engine.spec import Analysis
 from service.api.app import create_app
 from service.artefacts import ArtefactStore
@@ -44,7 +54,7 @@ def lease() -> Lease:
 
 def engine_result(**changes: Any) -> RunResult:
     one = Quantity(1.0, 0.1, 1.1)
-    pairs = [("paper", "free"), ("paper", "fixed"), ("projected", "free"), ("projected", "fixed")]
+    pairs = [(estimator, prior) for estimator in ESTIMATORS for prior in INDEX_PRIORS]
     whole: dict[str, Any] = {
         "realization_digest": "a" * 64,
         "engine_digest": "b" * 64,
@@ -52,7 +62,9 @@ def engine_result(**changes: Any) -> RunResult:
         "seed": 0,
         "noise_level": "author",
         "noise_treatment": "diagonal",
-        "estimates": tuple(Estimate(*pair, one, one, one, one, one, 30, 1, 0) for pair in pairs),  # type: ignore[arg-type]
+        "estimates": tuple(Estimate(*pair, *[one] * 8, 30, 1, 1, 0, 0) for pair in pairs),
+        "regularisation": "curvature",
+        "aperture": Aperture(1.0, one, 0.8, 30, 0),
         "lens": (LensParameter("theta_E", one), LensParameter("ln_lambda", Quantity(2.0, 0.2))),
         "chain": ChainSummary("converged", 24, 400, 100, 30.0, 240.0, 0.4, 9600),
         "ln_evidence": -10.0,
@@ -70,7 +82,9 @@ def engine_result(**changes: Any) -> RunResult:
 def test_an_engine_result_becomes_a_payload_that_survives_json() -> None:
     payload = result_payload(engine_result())
     assert set(payload.estimates) == set(ESTIMATES)
-    assert payload.estimates["paper_free"].n.bias == pytest.approx(-0.1)
+    found = payload.estimates["paper_free"]
+    assert found is not None
+    assert found.n.bias == pytest.approx(-0.1)
     assert (payload.wall_s, payload.cpu_s) == (3.0, 2.5)
     again = ResultPayload.model_validate_json(payload.model_dump_json())
     assert again == payload
@@ -91,9 +105,15 @@ def test_a_number_that_is_not_finite_is_no_result(bad: float) -> None:
         result_payload(engine_result(lens=(LensParameter("theta_E", Quantity(bad, 0.1)),)))
 
 
-def test_a_result_without_all_estimators_is_no_result() -> None:
-    with pytest.raises(InvalidResultError, match="projected_fixed"):
-        result_payload(engine_result(estimates=engine_result().estimates[:3]))
+def test_an_estimator_without_an_answer_is_null_and_one_that_is_not_named_no_result() -> None:
+    payload = result_payload(engine_result(estimates=engine_result().estimates[:3], aperture=None))
+    assert [name for name, found in payload.estimates.items() if found is not None] == list(ESTIMATES[:3])
+    assert payload.aperture is None
+    document = payload.model_dump(mode="json")
+    assert document["estimates"]["image_fixed"] is None
+    del document["estimates"]["image_fixed"]
+    with pytest.raises(InvalidResultError, match="image_fixed"):
+        read_payload(document)
 
 
 def test_analysis_overrides_follow_the_engine() -> None:

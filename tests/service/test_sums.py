@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
+from rich.console import Console
 from sqlalchemy import func, select
 
-from service.payload import ESTIMATES, QUANTITIES
+from service.payload import ESTIMATES
 from service.requests import GridRequest, plan
 from service.store.database import Database
 from service.store.grids import GridStore
@@ -15,14 +17,15 @@ from service.store.leadership import Leadership
 from service.store.migrate import downgrade, upgrade
 from service.store.queue import RunQueue
 from service.store.summary import summarise
-from service.store.tables import GROUP_COLUMNS, input_sum, result
+from service.store.tables import GROUP_COLUMNS, SUMMED, input_sum, result
+from service.tables import summary_table
 from tests.service.plans import result_of
 
 BODY = {"preset": "h0licow-vi/HE0435", "n": [2, 4], "l_eta": [1.0], "r_eff": [0.39], "replicates": 3}
 
 
 def stored(database: Database) -> str:
-    """A grid of several inputs with three runs each, some of them without a true axis ratio."""
+    """A grid of several inputs with three runs each, some of them without a true index."""
     request = GridRequest.model_validate(BODY)
     grid_id = GridStore(database).create(request.canonical(), lambda: plan(request, 1000)).grid.id
     generation = Leadership(database).take("test")
@@ -33,7 +36,8 @@ def stored(database: Database) -> str:
         for place, (lease, payload) in enumerate(results):
             if lease.spec["seed"] == 1:
                 free = payload.estimates["paper_free"]
-                unknown = free.model_copy(update={"q": free.q.model_copy(update={"truth": None})})
+                assert free is not None
+                unknown = free.model_copy(update={"n": free.n.model_copy(update={"truth": None})})
                 changed = {**payload.estimates, "paper_free": unknown}
                 results[place] = (lease, payload.model_copy(update={"estimates": changed}))
         queue.store_all(results)
@@ -61,11 +65,15 @@ def scatter(database: Database, grid_id: str, estimate: str, quantity: str) -> d
     return {place: stdev(means) for place, means in found.items()}
 
 
-def check(database: Database, grid_id: str) -> None:
+OLD = ("paper_free", "paper_fixed", "projected_free", "projected_fixed")
+"""The estimates of revisions before 0004."""
+
+
+def check(database: Database, grid_id: str, estimates: Sequence[str] = ESTIMATES) -> None:
     summary = summarise(database, GridStore(database).grid(grid_id), 1000)
     assert summary.n_stored == summary.n_runs == 3 * len(summary.rows)
-    for estimate in ESTIMATES:
-        for quantity in QUANTITIES:
+    for estimate in estimates:
+        for quantity in SUMMED:
             spread = scatter(database, grid_id, estimate, quantity)
             rows = straightforward(database, grid_id, estimate, quantity)
             for row, (*place, runs, mean, sd, bias) in zip(summary.rows, rows, strict=True):
@@ -94,11 +102,45 @@ def test_a_migration_adds_up_what_was_stored_before(database: Database, url: str
     database.close()
     downgrade(url, "0002")
     upgrade(url)
-    check(database, grid_id)
+    check(database, grid_id, OLD)
+    summary = summarise(database, GridStore(database).grid(grid_id), 1000)
+    for row in summary.rows:
+        assert {name for name, found in row.estimates.items() if found is not None} == set(OLD)
+    assert {name for name, found in summary.overall.items() if found is not None} == set(OLD)
     with database.read() as connection:
         after = [tuple(row) for row in connection.execute(select(input_sum))]
     assert len(before) == len(after)
     assert GridStore(database).grid(grid_id).counts.done == 3 * len(after)
+
+
+def test_a_run_without_an_answer_is_not_in_the_means(database: Database) -> None:
+    request = GridRequest.model_validate({**BODY, "n": [2], "magnitude": [20.5]})
+    grid_id = GridStore(database).create(request.canonical(), lambda: plan(request, 1000)).grid.id
+    generation = Leadership(database).take("test")
+    assert generation is not None
+    queue, expected = RunQueue(database), []
+    for lease in queue.claim(generation, 100):
+        payload = result_of(lease)
+        changed: dict[str, Any] = {**payload.estimates, "image_wide": None}
+        if lease.spec["seed"] == 1:
+            changed["paper_free"] = None
+        else:
+            found = payload.estimates["paper_free"]
+            assert found is not None
+            expected.append(found.magnitude.mean)
+        queue.store(lease, payload.model_copy(update={"estimates": changed}))
+    summary = summarise(database, GridStore(database).grid(grid_id), 1000)
+    (row,) = summary.rows
+    answered = row.estimates["paper_free"]
+    assert row.estimates["image_wide"] is None
+    assert summary.overall["image_wide"] is None
+    assert answered is not None
+    assert (row.n_runs, answered.runs) == (3, 2)
+    assert answered.magnitude.mean == pytest.approx(sum(expected) / 2)
+    assert answered.magnitude.bias == pytest.approx(sum(expected) / 2 - 20.5)
+    printed = Console(width=100, record=True)
+    printed.print(summary_table(summary))
+    assert "no estimate" in printed.export_text()
 
 
 def test_a_grid_that_has_ended_shows_what_a_fresh_count_would(database: Database) -> None:

@@ -1,0 +1,16 @@
+"""Sersic refits of reconstructed sources: one chain of draws, several estimators.
+
+:mod:`.draws` is what they are given, :mod:`.estimators` fits every draw by every estimator, :mod:`.summaries` turns the
+fits into means, deviations and biases. The estimators differ in the sum of squares that a profile is to minimise, each
+in a module of its own:
+
+========================  ==========================================================================
+:mod:`.paper`             unweighted on the drawn source map, as GALFIT without a sigma image
+:mod:`.covariance`        on the drawn source map, weighted by the posterior covariance of the source
+:mod:`.projected`         image-plane chi^2 of the profile on the source grid
+:mod:`.image`             image-plane chi^2 of the ray-traced profile itself: no grid, no regularisation
+========================  ==========================================================================
+
+:mod:`.aperture` measures the maps without a profile. :mod:`.profiles` has the profile and its derivatives averaged over
+cells, :mod:`.least_squares` the bounded fit of many draws at once.
+"""
