@@ -64,8 +64,7 @@ def single_precision(operator: Operator, lens: PowerLawLens, ln_lambda: float, m
     f, d = normal_equations(operator, lens, model)
     f = np.tril(f) + np.tril(f, -1).T
     dense = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening).dense()
-    p = operator.rays.pixels
-    w = operator.half_w[:, :p] + operator.half_w[:, :p].T
+    w = operator.coupling.dense() - operator.border @ operator.border.T
     rounded_w = w.astype(np.float32).astype(np.float64)
     single = (dense.T.astype(np.float32) @ (w.astype(np.float32) @ dense.astype(np.float32))).astype(np.float64)
     h = math.exp(ln_lambda) * regularisation_matrix(model)

@@ -307,6 +307,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
         noise_level=noise.level,
         noise_treatment=realization.analysis.noise_treatment,
         regularisation=realization.analysis.regularisation,
+        profile=realization.analysis.profile,
         estimates=found.estimates,
         aperture=found.aperture,
         lens=found.lens,

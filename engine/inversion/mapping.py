@@ -18,7 +18,8 @@ from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.inversion.nodes import spaced_nodes
-from engine.lensing.power_law import trace_rays
+from engine.lensing.power_law import PowerLawLens, trace_rays
+from engine.lensing.power_law import kernel_arguments as kernel_arguments_of_lens
 from engine.light.radial_table import look_up, tabulate
 from engine.light.sersic import SersicProfile, kernel_arguments, sersic_k, sersic_normalisation
 
@@ -90,19 +91,29 @@ class Envelope:
 
     The source is modelled as this times a smooth function t, so that the regularisation asks for smoothness relative
     to the expected run of the brightness and not of the brightness itself (cf. Nightingale et al. 2018, section 3.4,
-    who adapt its strength). ``x``, ``y`` of the profile count from the mean of the mapped anchors. Position and size go
-    with the source grid: ``size`` is the side [arcsec] of the grid for which r_eff holds, and a lens that magnifies
-    less, hence a larger grid, gets a larger envelope. What the envelope tells of the lens is then only its shape.
+    who adapt its strength). ``profile`` was found behind ``lens``; behind another its position and size go with the
+    source grid: it keeps its distance from the mean of the mapped anchors, and a lens that magnifies less, hence has a
+    larger grid, gets a larger envelope. What the envelope tells of the lens is then only its shape. ``x``, ``y`` of the
+    profile count from there; behind ``lens`` the anchors lie at ``anchor`` and the grid has a side of ``size``.
     """
 
     profile: SersicProfile
     floor: float
     size: float
+    lens: PowerLawLens
+    anchor: tuple[float, float]
 
     @cached_property
     def _table(self) -> FloatArray:
         table = tabulate(replace(self.profile, r_eff=1.0))
         return np.asarray(table / (sersic_normalisation(self.profile.n, 1.0) * math.exp(-sersic_k(self.profile.n))))
+
+    @property
+    def host(self) -> SersicProfile:
+        """The profile where it lies behind ``lens``, with the flux at which it is one at r_eff."""
+        p = self.profile
+        one = sersic_normalisation(p.n, p.r_eff) * math.exp(-sersic_k(p.n))
+        return replace(p, flux=1.0 / one, x=self.anchor[0] + p.x, y=self.anchor[1] + p.y)
 
     def placed(self, x: float, y: float, size: float) -> PlacedEnvelope:
         """The envelope about anchors at (x, y) [arcsec] on a grid of side ``size`` [arcsec]."""
@@ -136,6 +147,13 @@ class RayBundle:
     def pixels(self) -> int:
         """Number of image pixels with rays."""
         return self.in_mask.size
+
+    def of_envelope(self) -> FloatArray:
+        """Flux of each pixel (pixels,) by its rays for the envelope itself, without floor, behind its own lens."""
+        if self.envelope is None:
+            raise ValueError("rays: got none, allowed are rays with an envelope")
+        bare = replace(self, envelope=replace(self.envelope, floor=0.0), centre=None)
+        return map_rays(bare, kernel_arguments_of_lens(self.envelope.lens), (2, 2)).apply(np.ones(4))
 
     @property
     def columns(self) -> int:

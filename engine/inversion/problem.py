@@ -20,7 +20,6 @@ from engine.inversion.mapping import Envelope, RayBundle, cast_rays, map_rays
 from engine.inversion.operator import LinearData, Operator, build_operator
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import kernel_arguments, source_position
-from engine.light.sersic import sersic_k, sersic_normalisation
 from engine.modelling.parametric import ParametricFit
 from engine.spec import Analysis
 
@@ -116,25 +115,22 @@ def _envelope(fit: ParametricFit, rays: RayBundle) -> Envelope:
     if rays.anchors.size:
         ax, ay = source_position(fit.lens, rays.anchors[:, 0], rays.anchors[:, 1])
         x, y = float(ax.mean()), float(ay.mean())
-    return Envelope(replace(fit.host, flux=1.0, x=fit.host.x - x, y=fit.host.y - y), _ENVELOPE_FLOOR, size)
+    profile = replace(fit.host, flux=1.0, x=fit.host.x - x, y=fit.host.y - y)
+    return Envelope(profile, _ENVELOPE_FLOOR, size, fit.lens, (x, y))
 
 
 def _defect(
-    observation: Observation, fit: ParametricFit, mask: NDArray[np.bool_], rays: RayBundle, blurring: sparse.csr_matrix
+    observation: Observation, mask: NDArray[np.bool_], rays: RayBundle, blurring: sparse.csr_matrix
 ) -> FloatArray:
     """What B L lacks (M,) of the image of the envelope itself, behind the lens of the parametric fit.
 
     Sub-rays, the sampling of the light by pixels, the cut of the PSF: all that is wrong with the image of a known
     source can be known. It hardly changes with the lens within its posterior, and goes with t at the host's centre.
     """
-    host, envelope = fit.host, rays.envelope
-    if envelope is None:
-        raise TypeError("rays: without an envelope there is no defect")
-    bare = replace(rays, envelope=replace(envelope, floor=0.0))
-    mapping = map_rays(bare, kernel_arguments(fit.lens), (2, 2))
-    at_r_eff = sersic_normalisation(host.n, host.r_eff) * math.exp(-sersic_k(host.n))
-    exact = lensed_sersic_image(observation, replace(host, flux=1.0 / at_r_eff), fit.lens)[mask]
-    return np.asarray(exact - blurring @ mapping.apply(np.ones(4)))
+    if rays.envelope is None:
+        raise ValueError("rays: got none with an envelope; without one there is no defect")
+    exact = lensed_sersic_image(observation, rays.envelope.host, rays.envelope.lens)[mask]
+    return np.asarray(exact - blurring @ rays.of_envelope())
 
 
 def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Analysis) -> Problem:
@@ -170,7 +166,7 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
     blurring = _blurring(observation, analysis, mask, mask | margin)
     if analysis.source_envelope:
         rays = replace(rays, envelope=_envelope(fit, rays))
-        defect = _defect(observation, fit, mask, rays, blurring)
+        defect = _defect(observation, mask, rays, blurring)
         blurring = sparse.hstack([blurring, defect[:, None]], format="csr")
         image = max(solve_lens_equation(fit.lens, fit.host.x, fit.host.y), key=lambda found: abs(found.magnification))
         rays = replace(rays, centre=(image.x, image.y))

@@ -17,6 +17,7 @@ import numpy as np
 
 from engine.conventions import FloatArray
 from engine.errors import PosteriorError
+from engine.posterior.convergence import split_r_hat
 from engine.posterior.optimum import Laplace
 from engine.posterior.target import Target
 from engine.result import ChainStatus, ChainSummary
@@ -161,6 +162,7 @@ def run_chain(
         effective_samples=steps * walkers / tau,
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         evaluations=target.evaluations,
+        r_hat=split_r_hat(sampler.get_chain()),
     )
     return Chain(sampler.get_chain(), sampler.get_log_prob(), summary)
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas
 
 from engine.compiled import kernel
 from engine.conventions import FloatArray
@@ -21,7 +20,7 @@ from engine.inversion.operator import Operator
 from engine.lensing.power_law import PowerLawLens, convergence_and_shear, source_position
 from engine.refits.draws import SourceDraw
 from engine.refits.least_squares import NormalEquations
-from engine.refits.profiles import COLUMNS, add_cell, add_point, new_stack, shape_arguments
+from engine.refits.profiles import COLUMNS, add_cell, add_point, new_stack, shape_arguments, shape_of
 
 _CLEARANCE = 6.0
 """Distance of a share from the centre, in units of its size, from which its ray stands for it.
@@ -55,8 +54,9 @@ def _image_columns(
 class RayTracedModel:
     """Rays of an observation at one lens, and images of profiles by them."""
 
-    def __init__(self, operator: Operator, lens: PowerLawLens) -> None:
+    def __init__(self, operator: Operator, lens: PowerLawLens, defect: FloatArray | None = None) -> None:
         rays = operator.rays
+        self._defect = defect
         self._per_pixel = rays.subrays**2
         self._weight = rays.pixel_area / self._per_pixel
         self._x, self._y = source_position(lens, rays.x, rays.y)
@@ -65,12 +65,31 @@ class RayTracedModel:
         self._sides = half * np.stack([1.0 - kappa - gamma1, -gamma2, -gamma2, 1.0 - kappa + gamma1], axis=1)
 
     def columns(self, shape: FloatArray) -> FloatArray:
-        """Derivatives and flux (pixels, COLUMNS) per image pixel, before the PSF, of a profile of unit flux."""
-        return np.asarray(
-            _image_columns(
-                self._x, self._y, self._sides, self._per_pixel, self._weight, _CLEARANCE, shape_arguments(shape)
-            )
+        """Derivatives and flux (P, COLUMNS) per image pixel, before the PSF, of a profile of unit flux.
+
+        P counts the defect of the blurring too, where one is given.
+        """
+        columns = _image_columns(
+            self._x, self._y, self._sides, self._per_pixel, self._weight, _CLEARANCE, shape_arguments(shape)
         )
+        if self._defect is None:
+            return np.asarray(columns)
+        columns = np.vstack([columns, np.zeros((1, COLUMNS))])
+        columns[:, -1] += self._defect
+        return columns
+
+
+def _defect(operator: Operator) -> FloatArray | None:
+    """What the columns lack (P,) of the exact image of a host of unit flux like that of the parametric fit.
+
+    The defect column of the blurring is what the plain rays of that host lack; the integrals here differ from them.
+    """
+    rays = operator.rays
+    if rays.envelope is None:
+        return None
+    host = rays.envelope.host
+    integrals = RayTracedModel(operator, rays.envelope.lens).columns(shape_of(host))[:, -1]
+    return np.append(rays.of_envelope() / host.flux - integrals, 1.0 / host.flux)
 
 
 class ImageMetric:
@@ -82,30 +101,21 @@ class ImageMetric:
     """
 
     def __init__(self, operator: Operator, draws: Sequence[SourceDraw]) -> None:
-        pixels = operator.rays.pixels
-        # Row-major upper is column-major lower, as BLAS wants it; a copy only where the columns are padded.
-        self._lower = np.ascontiguousarray(operator.half_w[:, :pixels]).T
-        self._wd = operator.wd
-        self._models = [RayTracedModel(operator, draw.lens) for draw in draws]
+        self._operator = operator
+        defect = _defect(operator)
+        self._models = [RayTracedModel(operator, draw.lens, defect) for draw in draws]
         self._shared: FloatArray | None = None
-
-    def _weigh(self, images: FloatArray) -> FloatArray:
-        """W times images (pixels, any number): V x + V^T x with V the stored triangle."""
-        images = np.asfortranarray(images)
-        return np.asarray(
-            blas.dtrmm(1.0, self._lower, images, lower=1) + blas.dtrmm(1.0, self._lower, images, lower=1, trans_a=1)
-        )
 
     def normal_equations(self, which: NDArray[np.intp], shapes: FloatArray) -> NormalEquations:
         """See :class:`~.least_squares.Metric`."""
         columns = [self._models[k].columns(shape) for k, shape in zip(which, shapes, strict=True)]
-        right = np.array([found.T @ self._wd for found in columns])
+        right = np.array([found.T @ self._operator.wd for found in columns])
         units = np.ones(len(columns))
         if self._shared is None or len(columns) == 1:
-            wide = self._weigh(np.concatenate(columns, axis=1))
+            wide = self._operator.couple(np.concatenate(columns, axis=1))
             gram = np.array([found.T @ wide[:, COLUMNS * k : COLUMNS * (k + 1)] for k, found in enumerate(columns)])
             self._shared = gram[0]
             return NormalEquations(gram, gram[:, :, -1], right, units)
-        weighed = self._weigh(np.stack([found[:, -1] for found in columns], axis=1))
+        weighed = self._operator.couple(np.stack([found[:, -1] for found in columns], axis=1))
         cross = np.array([found.T @ weighed[:, k] for k, found in enumerate(columns)])
         return NormalEquations(np.repeat(self._shared[None], len(columns), axis=0), cross, right, units)

@@ -112,7 +112,7 @@ def test_an_inversion_of_drizzled_noise_has_chi2_one_with_the_covariance_and_not
     # One realization scatters by 0.04; 24 know the mean to 0.009.
     assert np.mean(chi2["covariance"]) == pytest.approx(1.0, abs=0.03)
     assert np.mean(chi2["diagonal"]) < 0.94
-    # The error of the source in units of what the data determine it to: stated rightly, and understated. A smooth source
+    # The error of the source in units of what the data determine it to: stated rightly, and understated. A source
     # is pulled towards its prior, which is worth ten per cent.
     assert np.mean(source_error["covariance"]) == pytest.approx(1.0, abs=0.15)
     assert np.mean(source_error["diagonal"]) > 1.4

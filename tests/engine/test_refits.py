@@ -10,8 +10,8 @@ from engine.conventions import rate_to_magnitude
 from engine.imaging.blurring import convolve
 from engine.inversion.blurring import pixel_kernel
 from engine.inversion.evidence import invert
-from engine.inversion.mapping import SourceGrid, cast_rays
-from engine.inversion.operator import Operator
+from engine.inversion.mapping import RayBundle, SourceGrid, cast_rays
+from engine.inversion.operator import LinearData, Operator, build_operator
 from engine.inversion.problem import ring_mask
 from engine.inversion.regularisation import SourceModel
 from engine.light.sersic import SersicProfile, flux_in_circle, surface_brightness
@@ -184,13 +184,10 @@ def test_the_ray_traced_model_is_the_noise_free_arc(simulation: Simulation) -> N
     assert error.sum() == pytest.approx(0.0, abs=2e-3 * simulation.arc[seen].sum())
 
 
-def _only(rays: object) -> Operator:
-    """An operator of which only the rays are looked at."""
-    empty = np.empty((0, 0))
-    none = np.empty(0)
-    from engine.inversion.operator import LinearData
-
-    return Operator(rays, empty, none, 0.0, 0.0, 0, 0, empty, LinearData(none, none, empty))  # type: ignore[arg-type]
+def _only(rays: RayBundle) -> Operator:
+    """An operator of which only the rays are looked at: it sees nothing of them."""
+    pixels = rays.pixels
+    return build_operator(LinearData(np.zeros(1), np.ones(1), np.zeros((1, 0))), np.zeros((1, pixels)), rays)
 
 
 def test_brighter_by_a_factor_is_brighter_and_nothing_else(operator: Operator) -> None:
@@ -303,7 +300,10 @@ def test_the_image_scatter_covers_the_noise() -> None:
     fluxes, spreads = [], []
     for seed in range(40):
         operator = ray_traced(Case(amplitudes=2), HOST, noise=300.0, seed=seed)
-        operator = replace(operator, half_w=operator.half_w / 9e4, wd=operator.wd / 9e4, dd=operator.dd / 9e4)
+        coupling = replace(operator.coupling, blocks=operator.coupling.blocks / 9e4)
+        operator = replace(
+            operator, coupling=coupling, border=operator.border / 300.0, wd=operator.wd / 9e4, dd=operator.dd / 9e4
+        )
         draws = [
             source_draw(invert(operator, LENS, 3.0, SourceModel((10, 10))), LENS, np.random.default_rng(seed))
         ] * 12
