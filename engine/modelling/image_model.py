@@ -1,0 +1,354 @@
+"""The parametric model of an image: AGN images, deflector, ray-traced Sersic host and a background.
+
+The amplitudes are linear and are solved for at every step (variable projection, Golub & Pereyra 1973; its Jacobian in
+the form of Kaufman 1975). Extended light is laid on the pixels by the weights of a cubic B-spline, so that the PSF is
+interpolated at every ray by the same spline as at every AGN image.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy import fft, sparse
+
+from engine.conventions import FloatArray, pixel_centres
+from engine.errors import PosteriorError
+from engine.imaging.blurring import place_spline, spline_coefficients, spline_weights
+from engine.imaging.observation import Observation
+from engine.lensing.power_law import PowerLawLens, source_position
+from engine.light.rendering import render_sersic, sample_sersic
+from engine.light.sersic import SersicProfile
+
+RENDER_TOLERANCE = 1e-3
+POSITION_ERROR = 0.01
+"""Image-plane accuracy [arcsec] asked of the AGN images as images of one source."""
+SLOPE_PRIOR = (2.0, 0.3)
+"""Mean and standard deviation; elliptical lenses have 2.08 +- 0.16 (Auger et al. 2010)."""
+SHEAR_PRIOR = 0.15
+ELLIPTICITY_PRIOR = 0.25
+CENTRE_PRIOR = 0.1
+"""Offset [arcsec] of the lens from the deflector's light, or from the frame where it has none."""
+_STEPS = {"deflector": (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4), "host": (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4)}
+_LENS_STEP = 1e-5
+_OUTSIDE = 24
+"""Pixels round the image from which the PSF brings deflector light in."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which components the model has, and where their parameters stand.
+
+    The parameters are [AGN x, y ...][deflector: ln r_eff, n, e1, e2, x, y][lens: theta_E, e1, e2, slope, x, y and
+    gamma1, gamma2 with shear][host: ln r_eff, n, e1, e2, x, y] with ellipticities e = (1 - q)/(1 + q); the amplitudes
+    [AGN ...][deflector][host][background].
+    """
+
+    n_agn: int
+    deflector: bool
+    shear: bool
+
+    @property
+    def deflector_slice(self) -> slice:
+        """Parameters of the deflector's light; empty where it has none."""
+        return slice(2 * self.n_agn, 2 * self.n_agn + (6 if self.deflector else 0))
+
+    @property
+    def lens_slice(self) -> slice:
+        """Parameters of the lens."""
+        first = self.deflector_slice.stop
+        return slice(first, first + (8 if self.shear else 6))
+
+    @property
+    def host_slice(self) -> slice:
+        """Parameters of the host."""
+        first = self.lens_slice.stop
+        return slice(first, first + 6)
+
+    @property
+    def size(self) -> int:
+        """Number of nonlinear parameters."""
+        return self.host_slice.stop
+
+    @property
+    def amplitudes(self) -> int:
+        """Number of linear ones."""
+        return self.n_agn + int(self.deflector) + 2
+
+    @property
+    def lens_names(self) -> tuple[str, ...]:
+        """Names of the lens parameters as physicists have them."""
+        return ("theta_E", "q", "phi", "slope", "x", "y", *(("gamma1", "gamma2") if self.shear else ()))
+
+
+def ellipse(e1: float, e2: float) -> tuple[float, float]:
+    """(q, phi) of ellipticity components e = (1 - q)/(1 + q)."""
+    e = min(math.hypot(e1, e2), 0.9)
+    return (1.0 - e) / (1.0 + e), 0.5 * math.atan2(e2, e1)
+
+
+def components(q: float, phi: float) -> tuple[float, float]:
+    """Ellipticity components of (q, phi)."""
+    e = (1.0 - q) / (1.0 + q)
+    return e * math.cos(2.0 * phi), e * math.sin(2.0 * phi)
+
+
+def sersic_of(values: Sequence[float] | FloatArray, flux: float = 1.0) -> SersicProfile:
+    """The profile of the parameters ln r_eff, n, e1, e2, x, y."""
+    ln_r, n, e1, e2, x, y = map(float, values)
+    return SersicProfile(flux, math.exp(ln_r), n, *ellipse(e1, e2), x, y)
+
+
+def lens_of(values: Sequence[float] | FloatArray) -> PowerLawLens:
+    """The lens of the parameters theta_E, e1, e2, slope, x, y (and gamma1, gamma2)."""
+    theta_E, e1, e2, slope, x, y, *shear = map(float, values)
+    return PowerLawLens(theta_E, *ellipse(e1, e2), slope, x, y, *shear)
+
+
+def deposit_matrix(pixels: int, subrays: int) -> sparse.csr_matrix:
+    """Matrix (pixels, pixels * subrays) that lays rays on pixels by cubic B-spline weights."""
+    rows, columns, values = [], [], []
+    for sub in range(subrays):
+        first, weights = spline_weights((sub + 0.5) / subrays - 0.5)
+        for k, weight in enumerate(weights):
+            to = np.arange(pixels) + first + k
+            inside = (to >= 0) & (to < pixels)
+            rows.append(to[inside])
+            columns.append((np.arange(pixels) * subrays + sub)[inside])
+            values.append(np.full(inside.sum(), weight))
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_matrix((np.concatenate(values), where), shape=(pixels, pixels * subrays))
+
+
+class _Blur:
+    """Light on sub-pixels through the PSF, on a window of the image and ``outside`` pixels round it.
+
+    ``x`` and ``y`` are the centres of the sub-pixels, ``side`` [arcsec] apart.
+    """
+
+    def __init__(
+        self, spline: FloatArray, x: FloatArray, y: FloatArray, scale: float, subrays: int, outside: int
+    ) -> None:
+        self.side = scale / subrays
+        self._outside, self._shape = outside, (y.size, x.size)
+        beyond = scale * np.arange(1, outside + 1)
+        offsets = ((np.arange(subrays) + 0.5) / subrays - 0.5) * scale
+        wide = [np.concatenate([axis[0] - beyond[::-1], axis, axis[-1] + beyond]) for axis in (x, y)]
+        self.x, self.y = (np.add.outer(axis, offsets).ravel() for axis in wide)
+        self._deposit_x, self._deposit_y = (deposit_matrix(axis.size, subrays) for axis in wide)
+        middle = spline.shape[0] // 2
+        columns, rows = (axis.size for axis in wide)
+        high, across = min(middle, rows - 1), min(middle, columns - 1)
+        self._fft_shape = (fft.next_fast_len(rows + high, real=True), fft.next_fast_len(columns + across, real=True))
+        kernel = np.zeros(self._fft_shape)
+        kernel[: 2 * high + 1, : 2 * across + 1] = spline[
+            middle - high : middle + high + 1, middle - across : middle + across + 1
+        ]
+        self._kernel = fft.rfft2(np.roll(kernel, (-high, -across), axis=(0, 1)))
+
+    def __call__(self, fine: FloatArray) -> FloatArray:
+        """Image (ny, nx) of the window from the flux of each sub-pixel."""
+        laid = (self._deposit_x @ (self._deposit_y @ fine).T).T
+        blurred = fft.irfft2(fft.rfft2(laid, self._fft_shape) * self._kernel, self._fft_shape)
+        k, (ny, nx) = self._outside, self._shape
+        return np.asarray(blurred[k : k + ny, k : k + nx])
+
+
+class ImageModel:
+    """Whitened columns of the amplitudes on a window of the image, and their derivatives.
+
+    Parameters
+    ----------
+    observation : Observation
+    layout : Layout
+    sigma : array (ny, nx)
+        Standard deviation of each pixel, errors of the PSF included; infinite where a pixel does not count.
+    window : pair of slices
+        Rows and columns that are modelled.
+    subrays : int
+        Rays along each side of a pixel.
+    exact : bool
+        Sersic light integrated over the sub-pixels to :data:`RENDER_TOLERANCE`, and AGN through the exposures where
+        these are known; without it the rays are samples and the AGN are shifted stamps: for quick first fits.
+    """
+
+    def __init__(
+        self,
+        observation: Observation,
+        layout: Layout,
+        sigma: FloatArray,
+        window: tuple[slice, slice],
+        *,
+        subrays: int,
+        exact: bool,
+    ) -> None:
+        self.observation, self.layout, self.window = observation, layout, window
+        self.subrays, self.exact = subrays, exact
+        ny, nx = observation.shape
+        scale = observation.pixel_scale
+        x, y = pixel_centres(nx, scale)[window[1]], pixel_centres(ny, scale)[window[0]]
+        self.shape = (y.size, x.size)
+        self._spline = spline_coefficients(observation.psf)
+        self._inner = _Blur(self._spline, x, y, scale, subrays, 0)
+        # The deflector shines beyond the image, and the PSF brings that light in.
+        self._outer = _Blur(self._spline, x, y, scale, subrays, min(_OUTSIDE, observation.psf.shape[0] // 2))
+        inside = sigma[window]
+        self.weight = np.where(np.isfinite(inside), 1.0 / inside, 0.0).ravel()
+        image = np.where(observation.valid, observation.image, 0.0)[window]
+        self.data = image.ravel() * self.weight
+        self.pixels = int(np.count_nonzero(self.weight))
+        self._point = lru_cache(maxsize=4 * max(layout.n_agn, 1))(self._render_point)
+        self._deflector = lru_cache(maxsize=4)(self._render_deflector)
+        self._host = lru_cache(maxsize=4)(self._render_host)
+
+    def _render_point(self, x: float, y: float) -> FloatArray:
+        if self.observation.response is None:
+            return self._stamp(x, y)
+        return self.observation.point_source(x, y)[self.window].ravel() * self.weight
+
+    def _stamp(self, x: float, y: float, along: str | None = None) -> FloatArray:
+        """The PSF moved to (x, y), or its derivative by a coordinate [1/arcsec]."""
+        scale, (ny, nx) = self.observation.pixel_scale, self.observation.shape
+        column = x / scale + (nx - 1) / 2.0 - self.window[1].start
+        row = y / scale + (ny - 1) / 2.0 - self.window[0].start
+        image = place_spline(self._spline, self.shape, column, row, along=along)
+        return np.asarray(image.ravel() * self.weight) / (1.0 if along is None else scale)
+
+    def _light(self, profile: SersicProfile, lens: PowerLawLens | None, *, exact: bool) -> FloatArray:
+        blur = self._outer if lens is None else self._inner
+        if exact:
+            fine = render_sersic(profile, blur.x, blur.y, blur.side, lens, RENDER_TOLERANCE)
+        else:
+            fine = sample_sersic(profile, lens, blur.x, blur.y, blur.side)
+        return blur(fine).ravel() * self.weight
+
+    def _render_deflector(self, *values: float) -> FloatArray:
+        return self._light(sersic_of(values), None, exact=self.exact)
+
+    def _render_host(self, *values: float) -> FloatArray:
+        split = len(values) - 6
+        return self._light(sersic_of(values[split:]), lens_of(values[:split]), exact=self.exact)
+
+    def columns(self, values: FloatArray) -> FloatArray:
+        """Whitened columns (pixels, amplitudes)."""
+        layout = self.layout
+        point = self._point if self.exact else self._stamp
+        out = [point(float(x), float(y)) for x, y in values[: 2 * layout.n_agn].reshape(-1, 2)]
+        if layout.deflector:
+            out.append(self._deflector(*values[layout.deflector_slice].tolist()))
+        out.append(self._host(*values[layout.lens_slice].tolist(), *values[layout.host_slice].tolist()))
+        out.append(self.weight)
+        return np.stack(out, axis=1)
+
+    def amplitudes(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Best amplitudes, whitened residuals, and the columns."""
+        columns = self.columns(values)
+        size = np.sqrt((columns**2).sum(axis=0))
+        if not (size > 0).all():
+            raise PosteriorError("parametric model: a component puts no light on the image")
+        scaled = columns / size
+        best = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ self.data, rcond=1e-12)[0]
+        return best / size, self.data - scaled @ best, columns
+
+    def constraints(self, values: FloatArray) -> FloatArray:
+        """Scatter of the AGN images in the source plane about the host, and the priors, each in its own error."""
+        layout = self.layout
+        lens, host = values[layout.lens_slice], values[layout.host_slice]
+        out = [
+            (lens[1:3]) / ELLIPTICITY_PRIOR,
+            [(lens[3] - SLOPE_PRIOR[0]) / SLOPE_PRIOR[1]],
+            (lens[4:6] - (values[layout.deflector_slice][4:6] if layout.deflector else 0.0)) / CENTRE_PRIOR,
+            lens[6:8] / SHEAR_PRIOR,
+        ]
+        if layout.n_agn:
+            agn = values[: 2 * layout.n_agn].reshape(-1, 2)
+            bx, by = source_position(lens_of(lens), agn[:, 0], agn[:, 1])
+            out += [(bx - host[4]) / POSITION_ERROR, (by - host[5]) / POSITION_ERROR]
+        return np.concatenate(out)
+
+    def residuals(self, values: FloatArray) -> FloatArray:
+        """Whitened residuals of the image, followed by :meth:`constraints`."""
+        return np.concatenate([self.amplitudes(values)[1], self.constraints(values)])
+
+    def jacobian(self, values: FloatArray) -> FloatArray:
+        """Derivatives of :meth:`residuals`; those of the columns by differences of samples, which costs a tenth."""
+        best, _, columns = self.amplitudes(values)
+        moved = self._column_derivatives(values, best)
+        basis, _ = np.linalg.qr(columns)
+        moved -= basis @ (basis.T @ moved)
+        return np.concatenate([-moved, _differences(self.constraints, values, 1e-6)])
+
+    def full_jacobian(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (rows, parameters + amplitudes) of data and constraints by all parameters; the amplitudes."""
+        best, _, columns = self.amplitudes(values)
+        rows = _differences(self.constraints, values, 1e-6)
+        top = np.concatenate([self._column_derivatives(values, best), columns], axis=1)
+        below = np.concatenate([-rows, np.zeros((rows.shape[0], best.size))], axis=1)
+        return np.concatenate([top, below]), best
+
+    def _column_derivatives(self, values: FloatArray, best: FloatArray) -> FloatArray:
+        """Change (pixels, parameters) of the whitened model with each nonlinear parameter."""
+        layout = self.layout
+        out = np.empty((self.data.size, layout.size))
+        for k in range(layout.n_agn):
+            x, y = map(float, values[2 * k : 2 * k + 2])
+            out[:, 2 * k] = best[k] * self._stamp(x, y, "column")
+            out[:, 2 * k + 1] = best[k] * self._stamp(x, y, "row")
+        if layout.deflector:
+            where = layout.deflector_slice
+            out[:, where] = best[layout.n_agn] * self._slopes(
+                lambda v: self._light(sersic_of(v), None, exact=False), values[where], _STEPS["deflector"]
+            )
+        lens_values, host_values = values[layout.lens_slice], values[layout.host_slice]
+        lens, host = lens_of(lens_values), sersic_of(host_values)
+        flux = best[-2]
+        out[:, layout.lens_slice] = flux * self._slopes(
+            lambda v: self._light(host, lens_of(v), exact=False), lens_values, (_LENS_STEP,) * lens_values.size
+        )
+        out[:, layout.host_slice] = flux * self._slopes(
+            lambda v: self._light(sersic_of(v), lens, exact=False), host_values, _STEPS["host"]
+        )
+        return out
+
+    @staticmethod
+    def _slopes(render: Callable[[FloatArray], FloatArray], values: FloatArray, steps: Sequence[float]) -> FloatArray:
+        here = render(values)
+        out = np.empty((here.size, values.size))
+        for k, step in enumerate(steps):
+            shifted = values.copy()
+            shifted[k] += step
+            out[:, k] = (render(shifted) - here) / step
+        return out
+
+
+def _differences(function: Callable[[FloatArray], FloatArray], values: FloatArray, step: float) -> FloatArray:
+    here = function(values)
+    out = np.empty((here.size, values.size))
+    for k in range(values.size):
+        shifted = values.copy()
+        shifted[k] += step
+        out[:, k] = (function(shifted) - here) / step
+    return out
+
+
+def window_round(
+    shape: tuple[int, int], pixel_scale: float, centre: tuple[float, float], radius: float
+) -> tuple[slice, slice]:
+    """Rows and columns of the image within ``radius`` [arcsec] of a centre along each axis."""
+    out = []
+    for n, middle in zip(shape, (centre[1], centre[0]), strict=True):
+        at = middle / pixel_scale + (n - 1) / 2.0
+        reach = radius / pixel_scale
+        out.append(slice(max(0, math.floor(at - reach)), min(n, math.ceil(at + reach) + 1)))
+    return out[0], out[1]
+
+
+def weights_sigma(observation: Observation, extra: FloatArray | None = None) -> FloatArray:
+    """Noise map with another variance (ny, nx) added; infinite where a pixel is not valid."""
+    variance = np.where(observation.valid, observation.noise, 1.0) ** 2
+    if extra is not None:
+        variance = variance + extra
+    return np.where(observation.valid, np.sqrt(variance), np.inf)
