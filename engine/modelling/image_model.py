@@ -34,6 +34,8 @@ CENTRE_PRIOR = 0.1
 """Offset [arcsec] of the lens from the deflector's light, or from the frame where it has none."""
 _STEPS = {"deflector": (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4), "host": (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4)}
 _LENS_STEP = 1e-5
+_ANCHOR = 5e-4
+"""Shift [arcsec] over which the difference of an AGN image from its stamp is taken for the same."""
 _OUTSIDE = 24
 """Pixels round the image from which the PSF brings deflector light in."""
 
@@ -71,7 +73,7 @@ class Layout:
     @property
     def size(self) -> int:
         """Number of nonlinear parameters."""
-        return self.host_slice.stop
+        return int(self.host_slice.stop)
 
     @property
     def amplitudes(self) -> int:
@@ -195,19 +197,26 @@ class ImageModel:
         self._inner = _Blur(self._spline, x, y, scale, subrays, 0)
         # The deflector shines beyond the image, and the PSF brings that light in.
         self._outer = _Blur(self._spline, x, y, scale, subrays, min(_OUTSIDE, observation.psf.shape[0] // 2))
+        self.sigma = sigma
         inside = sigma[window]
         self.weight = np.where(np.isfinite(inside), 1.0 / inside, 0.0).ravel()
         image = np.where(observation.valid, observation.image, 0.0)[window]
         self.data = image.ravel() * self.weight
         self.pixels = int(np.count_nonzero(self.weight))
-        self._point = lru_cache(maxsize=4 * max(layout.n_agn, 1))(self._render_point)
+        self._anchors: dict[int, tuple[float, float, FloatArray]] = {}
         self._deflector = lru_cache(maxsize=4)(self._render_deflector)
         self._host = lru_cache(maxsize=4)(self._render_host)
 
-    def _render_point(self, x: float, y: float) -> FloatArray:
-        if self.observation.response is None:
-            return self._stamp(x, y)
-        return self.observation.point_source(x, y)[self.window].ravel() * self.weight
+    def _point(self, index: int, x: float, y: float) -> FloatArray:
+        """Column of an AGN image. What the exposures make of it is remembered as long as it moves next to nothing."""
+        stamp = self._stamp(x, y)
+        if self.observation.response is None or not self.exact:
+            return stamp
+        anchor = self._anchors.get(index)
+        if anchor is None or math.hypot(x - anchor[0], y - anchor[1]) > _ANCHOR:
+            exact = self.observation.point_source(x, y)[self.window].ravel() * self.weight
+            anchor = self._anchors[index] = (x, y, exact - stamp)
+        return stamp + anchor[2]
 
     def _stamp(self, x: float, y: float, along: str | None = None) -> FloatArray:
         """The PSF moved to (x, y), or its derivative by a coordinate [1/arcsec]."""
@@ -235,8 +244,8 @@ class ImageModel:
     def columns(self, values: FloatArray) -> FloatArray:
         """Whitened columns (pixels, amplitudes)."""
         layout = self.layout
-        point = self._point if self.exact else self._stamp
-        out = [point(float(x), float(y)) for x, y in values[: 2 * layout.n_agn].reshape(-1, 2)]
+        positions = values[: 2 * layout.n_agn].reshape(-1, 2)
+        out = [self._point(k, float(x), float(y)) for k, (x, y) in enumerate(positions)]
         if layout.deflector:
             out.append(self._deflector(*values[layout.deflector_slice].tolist()))
         out.append(self._host(*values[layout.lens_slice].tolist(), *values[layout.host_slice].tolist()))
@@ -257,9 +266,9 @@ class ImageModel:
         """Scatter of the AGN images in the source plane about the host, and the priors, each in its own error."""
         layout = self.layout
         lens, host = values[layout.lens_slice], values[layout.host_slice]
-        out = [
+        out: list[FloatArray] = [
             (lens[1:3]) / ELLIPTICITY_PRIOR,
-            [(lens[3] - SLOPE_PRIOR[0]) / SLOPE_PRIOR[1]],
+            (lens[3:4] - SLOPE_PRIOR[0]) / SLOPE_PRIOR[1],
             (lens[4:6] - (values[layout.deflector_slice][4:6] if layout.deflector else 0.0)) / CENTRE_PRIOR,
             lens[6:8] / SHEAR_PRIOR,
         ]

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from engine.conventions import FloatArray
+from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
@@ -53,10 +54,13 @@ _MAX_ELLIPTICITY = 0.6
 _MOST_CANDIDATES = 6
 _AGN_NUMBERS = (4, 3, 2, 0)
 _ARC_STARTS = 4
-_ACCEPTABLE = 4.0
+ACCEPTABLE = 4.0
 """chi^2 per degree of freedom beyond which a fit is no start for anything."""
 _LONGEST_MISS = 5.0
 """Farthest that the AGN images may map from the host, in units of the accuracy asked of them."""
+_BORDER = 3
+_RADII, _LEAST_RADIUS = 3.0, 2.5
+"""The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
 HOST_NAMES = ("flux", "r_eff", "n", "q", "phi", "x", "y")
 
 
@@ -66,9 +70,10 @@ class ParametricFit:
 
     ``host.flux`` and ``deflector.flux`` are the fitted fluxes [e-/s]; ``agn`` are the fitted positions and fluxes;
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
-    that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by chi^2
-    per degree of freedom where that is above one; ``chi2`` counts all valid pixels with the PSF error added to their
-    noise, ``sigma`` (ny, nx); ``model`` and ``arc`` are images (ny, nx) of everything and of the lensed host [e-/s].
+    that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
+    chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
+    their noise and the error of the PSF, infinite where a pixel was not fitted. ``model`` and ``arc`` are images (ny, nx) of
+    everything and of the lensed host [e-/s].
     """
 
     lens: PowerLawLens
@@ -82,7 +87,6 @@ class ParametricFit:
     chi2: float
     degrees_of_freedom: int
     evaluations: int
-    starts: int
     at_bound: tuple[str, ...]
     model: FloatArray
     arc: FloatArray
@@ -107,7 +111,7 @@ def _start_vector(layout: Layout, start: Start, centre: tuple[float, float]) -> 
         values += [math.log(lens.theta_E), 4.0, 0.0, 0.01, *centre]
     values += [lens.theta_E, *components(lens.q, lens.phi), lens.slope, lens.x, lens.y]
     values += [lens.gamma1, lens.gamma2] if layout.shear else []
-    values += [math.log(0.3 * lens.theta_E), 2.0, 0.0, 0.01, *start.source]
+    values += [math.log(start.host_radius * lens.theta_E), 2.0, 0.0, 0.01, *start.source]
     return np.array(values)
 
 
@@ -166,6 +170,7 @@ def fit_parametric(
     shear: bool | None = False,
     theta_E: float | None = None,
     positions: Sequence[tuple[float, float]] | None = None,
+    acceptable: float = ACCEPTABLE,
 ) -> ParametricFit:
     """Find lens, AGN images and host, from nothing but the observation.
 
@@ -182,6 +187,8 @@ def fit_parametric(
         Rough Einstein radius [arcsec].
     positions : sequence of (x, y), optional
         Rough positions of the AGN images [arcsec, image frame]; then ``agn_images`` is their number.
+    acceptable : float
+        chi^2 per degree of freedom up to which a fit is handed on.
 
     Raises
     ------
@@ -190,34 +197,46 @@ def fit_parametric(
     PosteriorError
         No start leads to an acceptable fit; the message says what is wrong with the best.
     """
-    finder = _Finder(observation, deflector=deflector)
+    finder = _Finder(observation, deflector=deflector, acceptable=acceptable)
     radius = min(observation.shape) * observation.pixel_scale / 2
     _refuse(
         {
             "agn_images": (agn_images, agn_images is None or 0 <= agn_images <= 8, "a number from 0 to 8"),
-            "theta_E": (theta_E, theta_E is None or 0 < theta_E < radius, f"a radius on the image, 0-{radius:g} arcsec"),
+            "theta_E": (theta_E, theta_E is None or 0 < theta_E < radius, f"a radius on the image, below {radius:g}"),
         }
     )
     groups = finder.starts(agn_images, theta_E, positions)
-    quick = [solution for group in groups for solution in finder.quick(group)]
-    if not quick:
-        raise PosteriorError("parametric model: no start has a positive host")
-    quick.sort(key=lambda solution: solution.cost + solution.model.layout.n_agn * 3 * math.log(solution.model.pixels))
-    refusals = []
-    for solution in quick[:2]:
-        try:
-            polished = finder.polish(solution, shear=shear)
-            return finder.result(polished, len(quick))
-        except PosteriorError as error:
-            refusals.append(str(error))
-    raise PosteriorError("; then ".join(dict.fromkeys(refusals)))
+    refusals: list[str] = []
+    for wave in (groups, [_varied(group) for group in groups]):
+        for solution in finder.ranked([finder.quick(group) for group in wave]):
+            try:
+                return finder.result(finder.polish(solution, shear=shear))
+            except PosteriorError as error:
+                refusals.append(str(error))
+    raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
+
+
+def _information(solution: _Solution) -> float:
+    """The BIC less what is common to all solutions on one image."""
+    return solution.cost + 3 * solution.model.layout.n_agn * math.log(solution.model.pixels)
+
+
+def _varied(group: list[Start]) -> list[Start]:
+    """More starts for where the first ones led nowhere: other slopes, a smaller and a larger host, shear."""
+    seeds = group if len(group) <= _ARC_STARTS else group[:: max(1, len(group) // _ARC_STARTS)]
+    out = []
+    for start in seeds:
+        for slope, radius in ((1.8, 0.3), (2.2, 0.3), (2.0, 0.1), (2.0, 0.6)):
+            lens = start.lens.with_values(slope=slope, gamma1=0.01)
+            out.append(replace(start, lens=lens, host_radius=radius))
+    return out
 
 
 class _Finder:
     """The stages of the search for one observation."""
 
-    def __init__(self, observation: Observation, *, deflector: bool) -> None:
-        self.observation, self.has_deflector = observation, deflector
+    def __init__(self, observation: Observation, *, deflector: bool, acceptable: float) -> None:
+        self.observation, self.has_deflector, self.acceptable = observation, deflector, acceptable
         self.image = filled_image(observation)
         self.noise = np.where(
             observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
@@ -239,20 +258,25 @@ class _Finder:
             agn = tuple(Detection(float(x), float(y), self._flux_at(x, y), math.inf) for x, y in positions)
             hypotheses = [agn]
         else:
-            candidates = self._candidates(_MOST_CANDIDATES if number is None else number)
+            candidates = self._candidates(max(_MOST_CANDIDATES, number or 0))
             if number is not None and len(candidates) < number:
-                raise ObservationError(
-                    f"agn: found {len(candidates)} point sources of {number}, at five sigma or more"
-                )
+                raise ObservationError(f"agn: found {len(candidates)} point sources of {number}, at five sigma or more")
             hypotheses = agn_hypotheses(candidates, _AGN_NUMBERS if number is None else (number,), self.centre)
         groups = []
         for agn in hypotheses:
             if len(agn) >= 2:
                 groups.append(starts_from_agn(agn, self.centre))
             else:
-                rough = theta_E or ring_radius(self.image, self.noise, self.observation.pixel_scale, self.centre)
+                rough = theta_E or ring_radius(self.image, self.observation.pixel_scale, self.centre)
                 groups.append(starts_from_arc(rough, self.centre, agn))
         return groups
+
+    def _fitted(self, lens: PowerLawLens) -> NDArray[np.bool_]:
+        """Pixels (ny, nx) of the final fit: a circle, because nobody knows what shines into the image's border."""
+        scale, (ny, nx) = self.observation.pixel_scale, self.observation.shape
+        x, y = pixel_centres(nx, scale), pixel_centres(ny, scale)
+        radius = min(0.5 * min(ny, nx) * scale - _BORDER * scale, max(_LEAST_RADIUS, _RADII * lens.theta_E))
+        return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
 
     def _flux_at(self, x: float, y: float) -> float:
         observation = self.observation
@@ -268,7 +292,7 @@ class _Finder:
         window = window_round(
             observation.shape, observation.pixel_scale, self.centre, _QUICK_WINDOW * reach + _QUICK_MARGIN
         )
-        layout = Layout(len(first.agn), self.has_deflector, shear=False)
+        layout = Layout(len(first.agn), self.has_deflector, shear=first.lens.gamma1 != 0.0)
         # One noise map for all hypotheses, or their chi^2 could not be compared.
         sigma = weights_sigma(observation, _stamp_variance(observation, self._candidates(4)))
         model = ImageModel(observation, layout, sigma, window, subrays=_QUICK_SUBRAYS, exact=False)
@@ -300,48 +324,80 @@ class _Finder:
                 break
         return chosen
 
+    def ranked(self, groups: list[list[_Solution]]) -> list[_Solution]:
+        """The two solutions to go on with, the better one first.
+
+        A quick fit takes the cusp of a host for an AGN image, so that solutions with and without AGN are compared as
+        fits of full accuracy on one noise map.
+        """
+        best = sorted((min(group, key=_information) for group in groups if group), key=_information)
+        if len(best) == 1:
+            return sorted(groups[0], key=_information)[:2]
+        rivals = [next((s for s in best if bool(s.model.layout.n_agn) is with_agn), None) for with_agn in (True, False)]
+        chosen = [solution for solution in rivals if solution is not None]
+        if len(chosen) < 2:
+            return best[:2]
+        sigma = self._sigma(chosen[0])
+        rated: list[tuple[float, int]] = [
+            (_information(_minimise(self._model(s.model.layout, sigma), s.start, s.values, _STEPS, 1e-4)), k)
+            for k, s in enumerate(chosen)
+        ]
+        return [chosen[k] for _, k in sorted(rated)]
+
+    def _sigma(self, quick: _Solution) -> FloatArray:
+        """Standard deviation of the pixels of the final fit, with the error of the AGN as they were quickly fitted."""
+        values, layout = quick.values, quick.model.layout
+        agn = _fitted_agn(layout, values, quick.model.amplitudes(values)[0], quick.start.agn)
+        sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
+        sigma[~self._fitted(lens_of(values[layout.lens_slice]))] = np.inf
+        return sigma
+
+    def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
+        ny, nx = self.observation.shape
+        return ImageModel(self.observation, layout, sigma, (slice(0, ny), slice(0, nx)), subrays=_SUBRAYS, exact=True)
+
     def polish(self, quick: _Solution, *, shear: bool | None) -> _Solution:
         """The fit of the whole image from a quick one; with shear where it is wanted, or is worth its parameters."""
         values, layout = quick.values, quick.model.layout
-        amplitudes = quick.model.amplitudes(values)[0]
-        agn = _fitted_agn(layout, values, amplitudes, quick.start.agn)
-        sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
-        ny, nx = self.observation.shape
-        whole = (slice(0, ny), slice(0, nx))
+        sigma = self._sigma(quick)
 
         def model(with_shear: bool) -> ImageModel:
-            chosen = replace(layout, shear=with_shear)
-            return ImageModel(self.observation, chosen, sigma, whole, subrays=_SUBRAYS, exact=True)
+            return self._model(replace(layout, shear=with_shear), sigma)
 
-        def sheared(plain: FloatArray) -> FloatArray:
-            return np.insert(plain, layout.lens_slice.stop, [0.0, 0.0])
+        def sheared(found: FloatArray) -> FloatArray:
+            return found if layout.shear else np.insert(found, layout.lens_slice.stop, [0.0, 0.0])
+
+        def plain(found: FloatArray) -> FloatArray:
+            stop = layout.lens_slice.stop
+            return np.delete(found, [stop - 2, stop - 1]) if layout.shear else found
 
         if shear:
             best = _minimise(model(True), quick.start, sheared(values), _STEPS, 1e-6)
         else:
-            best = _minimise(model(False), quick.start, values, _STEPS, 1e-6)
+            best = _minimise(model(False), quick.start, plain(values), _STEPS, 1e-6)
             if shear is None:
-                other = _minimise(model(True), quick.start, sheared(best.values), _STEPS, 1e-6)
+                beside = np.insert(best.values, best.model.layout.lens_slice.stop, [0.0, 0.0])
+                other = _minimise(model(True), quick.start, beside, _STEPS, 1e-6)
                 self.evaluations += other.evaluations
                 if best.cost - other.cost > 2.0 * math.log(best.model.pixels):
                     best = other
         self.evaluations += best.evaluations
         return best
 
-    def result(self, solution: _Solution, starts: int) -> ParametricFit:
+    def result(self, solution: _Solution) -> ParametricFit:
         """The fit as it is handed on; a PosteriorError where it is no good."""
         model, values, layout = solution.model, solution.values, solution.model.layout
         jacobian, amplitudes = model.full_jacobian(values)
-        _, rest, columns = model.amplitudes(values)
+        _, rest, _ = model.amplitudes(values)
         chi2, freedom = float(rest @ rest), model.pixels - layout.size - layout.amplitudes
         host = sersic_of(values[layout.host_slice], 1.0)
         flux = float(amplitudes[-2])
         if not flux > 0:
             raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
-        if not freedom > 0 or chi2 > _ACCEPTABLE * freedom:
+        if not freedom > 0 or chi2 > self.acceptable * freedom:
             raise PosteriorError(
                 f"parametric model: chi2 is {chi2:.0f} for {freedom} degrees of freedom, "
-                f"{_ACCEPTABLE:g} times as many are allowed"
+                f"{self.acceptable:g} times as many are allowed"
             )
         if layout.n_agn:
             miss = float(np.abs(model.constraints(values)[-2 * layout.n_agn :]).max())
@@ -352,16 +408,9 @@ class _Finder:
                 )
         inflation = max(1.0, chi2 / freedom)
         covariance = inflation * _covariance(jacobian)
-        weight = np.where(model.weight > 0, model.weight, 1.0)
         shape = self.observation.shape
-        fitted = (columns / weight[:, None]) @ amplitudes
-        if not self.observation.valid.all():
-            shown = ImageModel(
-                self.observation, layout, np.ones(shape), model.window, subrays=_SUBRAYS, exact=True
-            ).columns(values)
-            fitted, arc = shown @ amplitudes, shown[:, -2] * flux
-        else:
-            arc = columns[:, -2] / weight * flux
+        shown = ImageModel(self.observation, layout, np.ones(shape), model.window, subrays=_SUBRAYS, exact=True)
+        columns = shown.columns(values)
         return ParametricFit(
             lens=lens_of(values[layout.lens_slice]),
             host=replace(host, flux=flux),
@@ -372,15 +421,14 @@ class _Finder:
             background=float(amplitudes[-1]),
             lens_names=layout.lens_names,
             lens_covariance=_lens_block(layout, covariance, values),
-            host_covariance=_host_block(layout, covariance, values, flux),
+            host_covariance=_host_block(layout, covariance, values),
             chi2=chi2,
             degrees_of_freedom=freedom,
             evaluations=self.evaluations,
-            starts=starts,
             at_bound=_at_bound(solution),
-            model=fitted.reshape(shape),
-            arc=arc.reshape(shape),
-            sigma=np.where(model.weight > 0, 1.0 / weight, np.inf).reshape(shape),
+            model=(columns @ amplitudes).reshape(shape),
+            arc=(columns[:, -2] * flux).reshape(shape),
+            sigma=model.sigma,
         )
 
 
@@ -416,7 +464,7 @@ def _lens_block(layout: Layout, covariance: FloatArray, values: FloatArray) -> F
     return np.asarray(chain @ covariance[where, where] @ chain.T)
 
 
-def _host_block(layout: Layout, covariance: FloatArray, values: FloatArray, flux: float) -> FloatArray:
+def _host_block(layout: Layout, covariance: FloatArray, values: FloatArray) -> FloatArray:
     """Covariance of (flux, r_eff, n, q, phi, x, y), by the chain rule."""
     where = layout.host_slice
     chosen = [layout.size + layout.amplitudes - 2, *range(where.start, where.stop)]

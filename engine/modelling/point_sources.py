@@ -27,10 +27,8 @@ class Detection:
     significance: float
 
 
-def remove_deflector(
-    image: FloatArray, pixel_scale: float, centre: tuple[float, float] = (0.0, 0.0)
-) -> FloatArray:
-    """The image less the median over circles round ``centre`` [arcsec]: point sources and arcs stay, the deflector goes."""
+def remove_deflector(image: FloatArray, pixel_scale: float, centre: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
+    """The image less the median over circles round ``centre``: point sources and arcs stay, the deflector goes."""
     y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
     radius = np.hypot(x - centre[0], y - centre[1])
     _, ring = np.unique(np.rint(radius / pixel_scale), return_inverse=True)

@@ -14,7 +14,7 @@ from engine.conventions import FloatArray, pixel_centres
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.modelling.lens_start import lens_from_positions
-from engine.modelling.point_sources import Detection, remove_deflector
+from engine.modelling.point_sources import Detection
 
 _CENTRE_REACH = 0.5
 """Farthest [arcsec] that the deflector is looked for from the middle of the image."""
@@ -27,17 +27,17 @@ _ARC_ELLIPTICITY = 0.12
 _ARC_ANGLES = 4
 _ARC_OFFSETS = 5
 _ARC_REACH = 0.25
-_HOST_RADIUS = 0.3
 _DOUBLE_AXIS_RATIO = 0.75
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where one fit begins: AGN images, lens and source position [arcsec]."""
+    """Where one fit begins: AGN images, lens, source position [arcsec], and the host's size in Einstein radii."""
 
     agn: tuple[Detection, ...]
     lens: PowerLawLens
     source: tuple[float, float]
+    host_radius: float = 0.3
 
 
 def filled_image(observation: Observation) -> FloatArray:
@@ -63,7 +63,7 @@ def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, floa
     while True:
         rows, columns = slice(row - 1, row + 2), slice(column - 1, column + 2)
         step = np.unravel_index(int(np.argmax(smooth[rows, columns])), (3, 3))
-        if step == (1, 1):
+        if int(step[0]) == 1 and int(step[1]) == 1:
             break
         row, column = row + int(step[0]) - 1, column + int(step[1]) - 1
         if math.hypot(row - start_row, column - start_column) > reach:
@@ -78,11 +78,11 @@ def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, floa
     )
 
 
-def ring_radius(image: FloatArray, noise: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> float:
+def ring_radius(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> float:
     """Radius [arcsec] at which light that is not the deflector's stands out most: a rough Einstein radius.
 
     On each circle round the deflector the excess over the lower quartile, which the deflector alone would fill, is
-    summed in units of the noise. Circles within three pixels are the deflector's own.
+    summed. Circles within three pixels are the deflector's own.
     """
     y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
     ring = np.rint(np.hypot(x - centre[0], y - centre[1]) / pixel_scale).astype(int)
@@ -102,23 +102,26 @@ def ring_radius(image: FloatArray, noise: FloatArray, pixel_scale: float, centre
 def agn_hypotheses(
     candidates: Sequence[Detection], numbers: Sequence[int], centre: tuple[float, float]
 ) -> list[tuple[Detection, ...]]:
-    """For each number of images the candidates that are best explained as images of one source.
+    """For each number of images the candidates that are taken for images of one source.
 
-    For one or two images these are the brightest ones; for more, those whose positions fit a lens best.
+    They are the brightest ones; three or more must also map within :data:`_CONSISTENT` of each other, and where no such
+    set is found, those that come closest are taken.
     """
     out: list[tuple[Detection, ...]] = []
     for number in numbers:
-        if number == 0:
-            out.append(())
-        elif len(candidates) == number or (number <= 2 < len(candidates) + 1 and len(candidates) >= number):
+        if number <= min(2, len(candidates)):
             out.append(tuple(candidates[:number]))
-        elif len(candidates) > number:
-            rated = []
-            for chosen in combinations(candidates[:_MOST_CANDIDATES], number):
-                misfit = lens_from_positions([(d.x, d.y) for d in chosen], centre=centre)[2]
-                faintness = -sum(math.log(d.flux) for d in chosen)
-                rated.append((misfit > _CONSISTENT, round(misfit / _CONSISTENT), faintness, chosen))
-            out.append(min(rated, key=lambda entry: entry[:3])[3])
+        elif number <= len(candidates):
+            sets = sorted(
+                combinations(candidates[: max(number, _MOST_CANDIDATES)], number),
+                key=lambda chosen: -sum(math.log(detection.flux) for detection in chosen),
+            )
+            misfits: list[float] = []
+            for chosen in sets:
+                misfits.append(lens_from_positions([(d.x, d.y) for d in chosen], centre=centre)[2])
+                if misfits[-1] < _CONSISTENT:
+                    break
+            out.append(sets[int(np.argmin(misfits))])
     return out
 
 
