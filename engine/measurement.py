@@ -33,7 +33,7 @@ POOR_FIT = 1.5
 _ACCEPTABLE = 100.0
 _NORMAL_95 = 1.959963985
 _MAD = 1.4826
-_OUTSKIRTS = 1.9
+_OUTSKIRTS = 1.6
 """Einstein radii from the lens beyond which residuals tell the noise and not the model."""
 _FEWEST_PIXELS = 200
 _NOISE_AGREES = 0.1

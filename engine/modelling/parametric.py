@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.optimize import least_squares
 
 from engine.conventions import FloatArray, pixel_centres
@@ -44,10 +45,12 @@ _QUICK_WINDOW = 1.6
 """Half-width of the window of the quick fits in Einstein radii, to which a margin comes."""
 _QUICK_MARGIN = 0.5
 _QUICK_STEPS, _STEPS = 15, 40
-_STAMP_SHIFT = 0.006
+_STAMP_SHIFT = 0.003
 """Error of a moved PSF stamp, as a shift [arcsec]: a drizzled pixel does not see its light where its centre is."""
 _STAMP_ERROR = 0.005
 """And as a fraction of the AGN's light."""
+_STAMP_CORRELATION = 2.0
+"""Pixels over which the error of a stamp stays the same, as the standard deviation of a Gaussian."""
 _RESPONSE_ERROR = 0.002
 """The same where the exposures are known: what errors of position leave."""
 _MAX_ELLIPTICITY = 0.6
@@ -61,6 +64,8 @@ _LONGEST_MISS = 5.0
 _BORDER = 3
 _RADII, _LEAST_RADIUS = 3.0, 2.5
 """The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
+_FEWEST_RADII = 2.2
+"""Einstein radii that are fitted even where stamps of AGN images end in them."""
 HOST_NAMES = ("flux", "r_eff", "n", "q", "phi", "x", "y")
 
 
@@ -72,8 +77,8 @@ class ParametricFit:
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
     that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
     chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
-    their noise and the error of the PSF, infinite where a pixel was not fitted. ``model`` and ``arc`` are images (ny, nx) of
-    everything and of the lensed host [e-/s].
+    their noise and the error of the PSF, infinite where a pixel was not fitted. ``model`` and ``arc`` are images
+    (ny, nx) of everything and of the lensed host [e-/s].
     """
 
     lens: PowerLawLens
@@ -139,6 +144,13 @@ def _minimise(model: ImageModel, start: Start, values: FloatArray, steps: int, t
         max_nfev=steps,
     )  # fmt: skip
     return _Solution(model, fit.x, 2.0 * float(fit.cost), int(fit.nfev), start)
+
+
+def _stamp_radius(psf: FloatArray) -> int:
+    """Pixels from the middle of a stamp to the nearest side of what is not padding."""
+    rows, columns = (np.flatnonzero(np.any(psf != 0, axis=axis)) for axis in (1, 0))
+    middle = psf.shape[0] // 2
+    return int(min(middle - rows[0], rows[-1] - middle, middle - columns[0], columns[-1] - middle))
 
 
 def _stamp_variance(observation: Observation, agn: Sequence[Detection]) -> FloatArray:
@@ -271,11 +283,17 @@ class _Finder:
                 groups.append(starts_from_arc(rough, self.centre, agn))
         return groups
 
-    def _fitted(self, lens: PowerLawLens) -> NDArray[np.bool_]:
-        """Pixels (ny, nx) of the final fit: a circle, because nobody knows what shines into the image's border."""
+    def _fitted(self, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray[np.bool_]:
+        """Pixels (ny, nx) of the final fit: a circle.
+
+        Nobody knows what shines into the image's border; and where the stamp of an AGN image ends, its light does not.
+        """
         scale, (ny, nx) = self.observation.pixel_scale, self.observation.shape
         x, y = pixel_centres(nx, scale), pixel_centres(ny, scale)
-        radius = min(0.5 * min(ny, nx) * scale - _BORDER * scale, max(_LEAST_RADIUS, _RADII * lens.theta_E))
+        frame = 0.5 * min(ny, nx) * scale - _BORDER * scale
+        reach = max((math.hypot(found.x - lens.x, found.y - lens.y) for found in agn), default=0.0)
+        stamp = max(_stamp_radius(self.observation.psf) * scale - reach, _FEWEST_RADII * lens.theta_E)
+        radius = min(frame, stamp if agn else frame, max(_LEAST_RADIUS, _RADII * lens.theta_E))
         return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
 
     def _flux_at(self, x: float, y: float) -> float:
@@ -311,7 +329,7 @@ class _Finder:
 
     def _best_linear(self, model: ImageModel, group: list[Start]) -> list[Start]:
         """The best starts by the linear fit alone, no two of them of the same lens."""
-        rated = []
+        rated: list[tuple[float, int, Start]] = []
         for start in group:
             amplitudes, rest, _ = model.amplitudes(_start_vector(model.layout, start, self.centre))
             if amplitudes[-2] > 0:
@@ -349,7 +367,7 @@ class _Finder:
         values, layout = quick.values, quick.model.layout
         agn = _fitted_agn(layout, values, quick.model.amplitudes(values)[0], quick.start.agn)
         sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
-        sigma[~self._fitted(lens_of(values[layout.lens_slice]))] = np.inf
+        sigma[~self._fitted(lens_of(values[layout.lens_slice]), agn)] = np.inf
         return sigma
 
     def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
@@ -384,6 +402,27 @@ class _Finder:
         self.evaluations += best.evaluations
         return best
 
+    def _shared(self, model: ImageModel, jacobian: FloatArray) -> FloatArray:
+        """J^T (C - diag C) J of the whitened Jacobian: what pixels share of their noise and of the stamps' error."""
+        shape, size = self.observation.shape, jacobian.shape[1]
+        noise = np.where(self.observation.valid, self.observation.noise, 0.0)
+        inside = np.where(np.isfinite(model.sigma), model.sigma, 0.0)
+        stamp = np.sqrt(np.maximum(inside**2 - noise**2, 0.0)) * (inside > 0)
+        out = np.zeros((size, size))
+        if self.observation.response is None and stamp.any():
+            moved = (jacobian.reshape(*shape, size) * (stamp.ravel() * model.weight).reshape(*shape, 1)).copy()
+            width = (_STAMP_CORRELATION, _STAMP_CORRELATION, 0.0)
+            # A Gaussian filter has unit sum; the correlation of a pixel with itself is one.
+            smooth = ndimage.gaussian_filter(moved, width, mode="constant") * (2.0 * math.pi * _STAMP_CORRELATION**2)
+            flat = moved.reshape(-1, size)
+            out += flat.T @ (smooth.reshape(-1, size) - flat)
+        if self.observation.covariance is not None:
+            shared = self.observation.covariance.copy()
+            shared.setdiag(0.0)
+            weighted = jacobian * model.weight[:, None]
+            out += weighted.T @ (shared @ weighted)
+        return 0.5 * (out + out.T)
+
     def result(self, solution: _Solution) -> ParametricFit:
         """The fit as it is handed on; a PosteriorError where it is no good."""
         model, values, layout = solution.model, solution.values, solution.model.layout
@@ -407,7 +446,7 @@ class _Finder:
                     f"{_LONGEST_MISS:g} are allowed"
                 )
         inflation = max(1.0, chi2 / freedom)
-        covariance = inflation * _covariance(jacobian)
+        covariance = inflation * _covariance(jacobian, self._shared(model, jacobian[: model.data.size]))
         shape = self.observation.shape
         shown = ImageModel(self.observation, layout, np.ones(shape), model.window, subrays=_SUBRAYS, exact=True)
         columns = shown.columns(values)
@@ -442,11 +481,14 @@ def _fitted_agn(
     )
 
 
-def _covariance(jacobian: FloatArray) -> FloatArray:
+def _covariance(jacobian: FloatArray, shared: FloatArray) -> FloatArray:
+    """Covariance of a least-squares fit whose residuals share ``shared`` = J^T (C - 1) J: H^-1 (H + shared) H^-1."""
     scale = np.sqrt((jacobian**2).sum(axis=0))
     scale[scale == 0.0] = 1.0
     scaled = jacobian / scale
-    return np.asarray(np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True) / np.outer(scale, scale))
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)
+    joint = inverse + inverse @ (shared / np.outer(scale, scale)) @ inverse
+    return np.asarray(joint / np.outer(scale, scale))
 
 
 def _shape_chain(e1: float, e2: float) -> FloatArray:
