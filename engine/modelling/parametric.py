@@ -220,7 +220,7 @@ def fit_parametric(
     groups = finder.starts(agn_images, theta_E, positions)
     refusals: list[str] = []
     for wave in (groups, [_varied(group) for group in groups]):
-        for solution in finder.ranked([finder.quick(group) for group in wave]):
+        for solution in finder.ranked([finder.quick(group) for group in wave], shear=shear is not False):
             try:
                 return finder.result(finder.polish(solution, shear=shear))
             except PosteriorError as error:
@@ -342,11 +342,11 @@ class _Finder:
                 break
         return chosen
 
-    def ranked(self, groups: list[list[_Solution]]) -> list[_Solution]:
+    def ranked(self, groups: list[list[_Solution]], *, shear: bool) -> list[_Solution]:
         """The two solutions to go on with, the better one first.
 
-        A quick fit takes the cusp of a host for an AGN image, so that solutions with and without AGN are compared as
-        fits of full accuracy on one noise map.
+        A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so solutions with and
+        without AGN are compared as fits of full accuracy, with ``shear`` where there may be some, on one noise map.
         """
         best = sorted((min(group, key=_information) for group in groups if group), key=_information)
         if len(best) == 1:
@@ -356,10 +356,13 @@ class _Finder:
         if len(chosen) < 2:
             return best[:2]
         sigma = self._sigma(chosen[0])
-        rated: list[tuple[float, int]] = [
-            (_information(_minimise(self._model(s.model.layout, sigma), s.start, s.values, _STEPS, 1e-4)), k)
-            for k, s in enumerate(chosen)
-        ]
+        rated: list[tuple[float, int]] = []
+        for k, solution in enumerate(chosen):
+            layout = replace(solution.model.layout, shear=shear)
+            values = _with_shear(solution.values, solution.model.layout, shear=shear)
+            full = _minimise(self._model(layout, sigma), solution.start, values, _STEPS, 1e-4)
+            self.evaluations += full.evaluations
+            rated.append((_information(full), k))
         return [chosen[k] for _, k in sorted(rated)]
 
     def _sigma(self, quick: _Solution) -> FloatArray:
@@ -382,19 +385,12 @@ class _Finder:
         def model(with_shear: bool) -> ImageModel:
             return self._model(replace(layout, shear=with_shear), sigma)
 
-        def sheared(found: FloatArray) -> FloatArray:
-            return found if layout.shear else np.insert(found, layout.lens_slice.stop, [0.0, 0.0])
-
-        def plain(found: FloatArray) -> FloatArray:
-            stop = layout.lens_slice.stop
-            return np.delete(found, [stop - 2, stop - 1]) if layout.shear else found
-
         if shear:
-            best = _minimise(model(True), quick.start, sheared(values), _STEPS, 1e-6)
+            best = _minimise(model(True), quick.start, _with_shear(values, layout, shear=True), _STEPS, 1e-6)
         else:
-            best = _minimise(model(False), quick.start, plain(values), _STEPS, 1e-6)
+            best = _minimise(model(False), quick.start, _with_shear(values, layout, shear=False), _STEPS, 1e-6)
             if shear is None:
-                beside = np.insert(best.values, best.model.layout.lens_slice.stop, [0.0, 0.0])
+                beside = _with_shear(best.values, best.model.layout, shear=True)
                 other = _minimise(model(True), quick.start, beside, _STEPS, 1e-6)
                 self.evaluations += other.evaluations
                 if best.cost - other.cost > 2.0 * math.log(best.model.pixels):
@@ -469,6 +465,14 @@ class _Finder:
             arc=(columns[:, -2] * flux).reshape(shape),
             sigma=model.sigma,
         )
+
+
+def _with_shear(values: FloatArray, layout: Layout, *, shear: bool) -> FloatArray:
+    """Parameters of a layout, with or without those of the shear, which start at zero."""
+    stop = layout.lens_slice.stop
+    if layout.shear == shear:
+        return values
+    return np.insert(values, stop, [0.0, 0.0]) if shear else np.delete(values, [stop - 2, stop - 1])
 
 
 def _fitted_agn(
