@@ -19,7 +19,7 @@ from engine.conventions import position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
-from engine.modelling.parametric import HOST_NAMES, ParametricFit, fit_parametric
+from engine.modelling.parametric import HOST_NAMES, Acceptance, ParametricFit, fit_parametric
 from engine.result import Estimate, LensParameter
 from engine.run import Measurement, measure
 from engine.spec import Analysis
@@ -30,7 +30,8 @@ RECOMMENDED = ("image", "parametric")
 """Estimators by preference: the answer is that of the first which there is."""
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on the status says that the model does not describe the image."""
-_ACCEPTABLE = 100.0
+_ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
+"""What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
 _NORMAL_95 = 1.959963985
 _MAD = 1.4826
 _OUTSKIRTS = 1.6
@@ -268,7 +269,7 @@ def measure_image(
         tell("parametric fit")
         fit = fit_parametric(
             observation, agn_images=agn_images, deflector=deflector, shear=shear, theta_E=theta_E, positions=positions,
-            acceptable=_ACCEPTABLE,
+            acceptance=_ANY_LENS,
         )  # fmt: skip
         if inversion:
             tell("inversion")

@@ -12,7 +12,16 @@ from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from engine.conventions import FloatArray
-from engine.figures.sky import compass, corner_label, empty_sky_noise, name_points, scale_bar, show, stretch
+from engine.figures.sky import (
+    compass,
+    corner_label,
+    empty_sky_noise,
+    name_points,
+    scale_bar,
+    show,
+    stretch,
+    stretch_ticks,
+)
 from engine.light.sersic import surface_brightness
 from engine.measurement import ImageMeasurement
 
@@ -26,6 +35,10 @@ _SOURCE_UNIT = "e$^-$ s$^{-1}$ arcsec$^{-2}$, asinh"
 
 def _bar(figure: Figure, axes: Axes, shown: object, label: str) -> None:
     bar = figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.02)  # type: ignore[arg-type]
+    if isinstance(bar.norm, AsinhNorm):
+        ticks = stretch_ticks(bar.norm)
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        bar.minorticks_off()
     bar.ax.tick_params(labelsize=7)
     bar.set_label(label, fontsize=8)
 

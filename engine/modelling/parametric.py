@@ -21,6 +21,7 @@ from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
 from engine.modelling.image_model import (
+    POSITION_ERROR,
     ImageModel,
     Layout,
     components,
@@ -57,16 +58,23 @@ _MAX_ELLIPTICITY = 0.6
 _MOST_CANDIDATES = 6
 _AGN_NUMBERS = (4, 3, 2, 0)
 _ARC_STARTS = 4
-ACCEPTABLE = 4.0
-"""chi^2 per degree of freedom beyond which a fit is no start for anything."""
-_LONGEST_MISS = 5.0
-"""Farthest that the AGN images may map from the host, in units of the accuracy asked of them."""
 _BORDER = 3
 _RADII, _LEAST_RADIUS = 3.0, 2.5
 """The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
 _FEWEST_RADII = 2.2
 """Einstein radii that are fitted even where stamps of AGN images end in them."""
 HOST_NAMES = ("flux", "r_eff", "n", "q", "phi", "x", "y")
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """How bad a fit may be: chi^2 per degree of freedom; farthest that an AGN image maps from the host [arcsec]."""
+
+    chi2_per_dof: float = 4.0
+    miss: float = 0.05
+
+
+GOOD_START = Acceptance()
 
 
 @dataclass(frozen=True)
@@ -182,7 +190,7 @@ def fit_parametric(
     shear: bool | None = False,
     theta_E: float | None = None,
     positions: Sequence[tuple[float, float]] | None = None,
-    acceptable: float = ACCEPTABLE,
+    acceptance: Acceptance = GOOD_START,
 ) -> ParametricFit:
     """Find lens, AGN images and host, from nothing but the observation.
 
@@ -199,8 +207,8 @@ def fit_parametric(
         Rough Einstein radius [arcsec].
     positions : sequence of (x, y), optional
         Rough positions of the AGN images [arcsec, image frame]; then ``agn_images`` is their number.
-    acceptable : float
-        chi^2 per degree of freedom up to which a fit is handed on.
+    acceptance : Acceptance
+        How bad a fit may be that is handed on.
 
     Raises
     ------
@@ -209,7 +217,7 @@ def fit_parametric(
     PosteriorError
         No start leads to an acceptable fit; the message says what is wrong with the best.
     """
-    finder = _Finder(observation, deflector=deflector, acceptable=acceptable)
+    finder = _Finder(observation, deflector=deflector, acceptance=acceptance)
     radius = min(observation.shape) * observation.pixel_scale / 2
     _refuse(
         {
@@ -247,8 +255,8 @@ def _varied(group: list[Start]) -> list[Start]:
 class _Finder:
     """The stages of the search for one observation."""
 
-    def __init__(self, observation: Observation, *, deflector: bool, acceptable: float) -> None:
-        self.observation, self.has_deflector, self.acceptable = observation, deflector, acceptable
+    def __init__(self, observation: Observation, *, deflector: bool, acceptance: Acceptance) -> None:
+        self.observation, self.has_deflector, self.acceptance = observation, deflector, acceptance
         self.image = filled_image(observation)
         self.noise = np.where(
             observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
@@ -429,17 +437,17 @@ class _Finder:
         flux = float(amplitudes[-2])
         if not flux > 0:
             raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
-        if not freedom > 0 or chi2 > self.acceptable * freedom:
+        if not freedom > 0 or chi2 > self.acceptance.chi2_per_dof * freedom:
             raise PosteriorError(
                 f"parametric model: chi2 is {chi2:.0f} for {freedom} degrees of freedom, "
-                f"{self.acceptable:g} times as many are allowed"
+                f"{self.acceptance.chi2_per_dof:g} times as many are allowed"
             )
         if layout.n_agn:
-            miss = float(np.abs(model.constraints(values)[-2 * layout.n_agn :]).max())
-            if miss > _LONGEST_MISS:
+            miss = POSITION_ERROR * float(np.abs(model.constraints(values)[-2 * layout.n_agn :]).max())
+            if miss > self.acceptance.miss:
                 raise PosteriorError(
-                    f"parametric model: an AGN image maps {miss:.1f} times its accuracy from the host, "
-                    f"{_LONGEST_MISS:g} are allowed"
+                    f"parametric model: an AGN image maps {miss:.3f} arcsec from the host, "
+                    f"{self.acceptance.miss:g} are allowed"
                 )
         inflation = max(1.0, chi2 / freedom)
         covariance = inflation * _covariance(jacobian, self._shared(model, jacobian[: model.data.size]))
