@@ -301,7 +301,8 @@ class _Finder:
         frame = 0.5 * min(ny, nx) * scale - _BORDER * scale
         reach = max((math.hypot(found.x - lens.x, found.y - lens.y) for found in agn), default=0.0)
         stamp = max(_stamp_radius(self.observation.psf) * scale - reach, _FEWEST_RADII * lens.theta_E)
-        radius = min(frame, stamp if agn else frame, max(_LEAST_RADIUS, _RADII * lens.theta_E))
+        whole = not agn or self.observation.response is not None
+        radius = min(frame, frame if whole else stamp, max(_LEAST_RADIUS, _RADII * lens.theta_E))
         return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
 
     def _flux_at(self, x: float, y: float) -> float:

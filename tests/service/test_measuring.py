@@ -69,7 +69,7 @@ PARTS = ("--pixel-scale", "0.08", "--zeropoint", "25.9")
         (("{broken}",), "not a FITS file"),
         (("{image}", *PARTS), "--psf"),
         (("{image}", "--psf", "{psf}", "--pixel-scale", "0.08"), "--zeropoint"),
-        (("{image}", "--psf", "{psf}", "--zeropoint", "25.9"), "pixel_scale"),
+        (("{image}", "--noise", "{noise}", "--psf", "{psf}", "--zeropoint", "25.9"), "pixel_scale"),
         (("{image}", "--psf", "{psf}", *PARTS), "exposure"),
         (("{image}", "--noise", "{psf}", "--psf", "{psf}", *PARTS), "noise"),
         (("{own}", "--profile", "best"), "profile"),
