@@ -19,12 +19,14 @@ from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.foreign import NoiseFromImage, observation_from_arrays
 from engine.imaging.foreign_files import read_foreign_observation
 from engine.imaging.observation import Observation
+from engine.measurement import HostEstimate, ImageMeasurement, Measured, measure_image
 from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, measure, run
 from engine.scene import check_system
 from engine.seeds import generator
 from engine.simulation import Simulation, simulate_realization
 from engine.spec import (
+    PROFILES,
     Analysis,
     Camera,
     CameraChoice,
@@ -42,6 +44,7 @@ from engine.spec import (
 from engine.validation import field_steps, spec_error
 
 __all__ = [
+    "PROFILES",
     "STAGES",
     "Analysis",
     "Aperture",
@@ -53,10 +56,13 @@ __all__ = [
     "Grid",
     "GridRun",
     "Host",
+    "HostEstimate",
+    "ImageMeasurement",
     "InversionError",
     "LensEquationError",
     "LensParameter",
     "LensSystem",
+    "Measured",
     "Measurement",
     "NoiseFromImage",
     "NoiseLevel",
@@ -84,6 +90,7 @@ __all__ = [
     "load_camera",
     "load_system",
     "measure",
+    "measure_image",
     "observation_from_arrays",
     "preset_names",
     "read_camera",

@@ -25,7 +25,7 @@ from engine.inversion.problem import Problem, prepare_problem
 from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, mean_surface_brightness
-from engine.modelling.parametric import fit_parametric
+from engine.modelling.parametric import ParametricFit, fit_parametric
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Target, flat_prior
@@ -177,6 +177,7 @@ def measure(
     fixed_index: float | None = None,
     truth: Truth | None = None,
     watch: _Stopwatch | None = None,
+    fit: ParametricFit | None = None,
 ) -> Measurement:
     """Analyse an observation; ``truth`` is used for nothing but the biases.
 
@@ -193,6 +194,8 @@ def measure(
         Whether the deflector shines, whether the lens model has external shear.
     fixed_index : float, optional
         The n at which the fixed-n estimates hold it; without it there are none.
+    fit : ParametricFit, optional
+        Where to start, if it is known already.
 
     Raises
     ------
@@ -201,7 +204,8 @@ def measure(
     """
     watch = watch or _Stopwatch(None)
     with watch.stage("parametric"):
-        fit = fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
+        if fit is None:
+            fit = fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
     with watch.stage("prepare"):
         problem = prepare_problem(observation, fit, analysis)
     with watch.stage("optimum"):

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from service import VERSION
 from service.client import ApiError, Client
+from service.measuring import measure
 from service.pictures import COMMANDS, named_or_read
 from service.settings import Settings
 from service.tables import grid_line, runs_table, summary_table
@@ -29,7 +30,7 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
-for command in COMMANDS:
+for command in (*COMMANDS, measure):
     app.command()(command)
 
 Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]

@@ -64,7 +64,7 @@ def simulate(
         montage(system, **common, camera=camera, out=out)  # type: ignore[arg-type]
         return
     optics = {"defocus_nm": defocus_nm, "jitter": jitter} if defocus_nm or jitter else None
-    with _refusals():
+    with refusals():
         realization = _realization(
             system,
             HostOptions(_N if n is None else n, r_eff, magnitude, _L_ETA if l_eta is None else l_eta),
@@ -83,7 +83,7 @@ def montage(
     out: Out = Path(),
 ) -> None:
     """Picture the 48 realizations of a system, numbered as in the paper's Table 3."""
-    with _refusals():
+    with refusals():
         from engine import Grid, expand, simulate_realization  # noqa: PLC0415
         from engine.figures import montage_figure  # noqa: PLC0415
 
@@ -104,7 +104,7 @@ def gallery(
     out: Out = Path(),
 ) -> None:
     """Picture the eight systems side by side, each with its lensed host alone."""
-    with _refusals():
+    with refusals():
         from engine import Grid, expand, simulate_realization  # noqa: PLC0415
         from engine.figures import gallery_figure  # noqa: PLC0415
 
@@ -154,7 +154,7 @@ def named_or_read(system: str) -> str | dict[str, Any]:
     """A system for a request: the name as it is, a file as the table that it holds."""
     if not system.lower().endswith(_FILES):
         return system
-    with _refusals():
+    with refusals():
         from engine import read_mapping  # noqa: PLC0415
 
         return read_mapping(system)
@@ -222,7 +222,7 @@ def _progress(what: str, steps: int) -> Iterator[Any]:
 
 
 @contextmanager
-def _refusals() -> Iterator[None]:
+def refusals() -> Iterator[None]:
     """What the engine refuses ends the command with a line instead of a traceback."""
     from engine import EngineError  # noqa: PLC0415
 

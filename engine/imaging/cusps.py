@@ -10,11 +10,11 @@ band-limited, its convolution with what results is that with the light itself.
 from __future__ import annotations
 
 from functools import cache
-from typing import Protocol
 
 import numpy as np
 
 from engine.conventions import FloatArray
+from engine.imaging.geometry import Geometry
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
@@ -27,24 +27,11 @@ _NODES = 8
 """Sub-pixels along each axis among which a cell's light is divided: Lagrange interpolation of order 7."""
 
 
-class SubpixelGrid(Protocol):
-    """What is asked of a grid of sub-pixels, such as :class:`engine.imaging.geometry.Geometry`."""
-
-    @property
-    def subpixel_scale(self) -> float:
-        """Side of a sub-pixel [arcsec]."""
-        ...
-
-    def high_resolution_axes(self) -> tuple[FloatArray, FloatArray]:
-        """Coordinates [arcsec] of the sub-pixel centres: x of each column, y of each row."""
-        ...
-
-
 def place_cusps(
     image: FloatArray,
     profile: SersicProfile,
     positions: list[tuple[float, float]],
-    grid: SubpixelGrid,
+    geometry: Geometry,
     lens: PowerLawLens | None = None,
 ) -> FloatArray:
     """Replace the light round the cusps of a rendered profile by light that convolves as if nothing were pixelised.
@@ -52,7 +39,7 @@ def place_cusps(
     Parameters
     ----------
     image
-        (ny, nx) on the sub-pixels of ``grid``, flux per sub-pixel of ``profile`` behind ``lens``.
+        geometry.high_resolution_shape, flux per sub-pixel of ``profile`` behind ``lens``.
     positions
         Where the cusps are in the image [arcsec].
 
@@ -61,8 +48,8 @@ def place_cusps(
     Array of the same shape and total flux, for convolution with a PSF that is band-limited well below the sub-pixels;
     single values round the cusps may be negative.
     """
-    x, y = grid.high_resolution_axes()
-    scale, reach = grid.subpixel_scale, _NODES // 2
+    x, y = geometry.high_resolution_axes()
+    scale, reach = geometry.subpixel_scale, _NODES // 2
     placed = np.pad(image, reach)
     offsets = ((np.arange(_FINE) + 0.5) / _FINE - 0.5) * scale
     for index, (cusp_x, cusp_y) in enumerate(positions):

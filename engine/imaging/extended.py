@@ -1,18 +1,16 @@
 """Images of extended light as an observation shows them, exactly: the yardstick for quicker ways.
 
 Where the exposures are known, the light goes through the same dithers and drizzle; otherwise through the PSF stamp,
-interpolated between its pixels.
+interpolated by a cubic B-spline, and light is laid on the pixels by the weights of the same spline.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy import fft
+from scipy import fft, sparse
 
 from engine.conventions import FloatArray, pixel_centres
-from engine.imaging.blurring import convolve
+from engine.imaging.blurring import spline_coefficients, spline_weights
 from engine.imaging.cusps import place_cusps
 from engine.imaging.observation import Observation
 from engine.lensing.lens_equation import solve_lens_equation
@@ -21,62 +19,74 @@ from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
 
 _OVERSAMPLING = 5
-"""Sub-pixels along a pixel of an image whose exposures are not known; odd, so that pixel centres are among them."""
-_MARGIN = 12
+"""Sub-pixels along a pixel of an image whose exposures are not known."""
+_OUTSIDE = 12
 """Pixels beyond such an image whose light is carried into it."""
 
 
-@dataclass(frozen=True)
-class _SubpixelGrid:
-    """Sub-pixels of an image (ny, nx) and of a margin round it."""
+def deposit_matrix(pixels: int, subrays: int) -> sparse.csr_matrix:
+    """Matrix (pixels, pixels * subrays) that lays rays on pixels by cubic B-spline weights."""
+    rows, columns, values = [], [], []
+    for sub in range(subrays):
+        first, weights = spline_weights((sub + 0.5) / subrays - 0.5)
+        for k, weight in enumerate(weights):
+            to = np.arange(pixels) + first + k
+            inside = (to >= 0) & (to < pixels)
+            rows.append(to[inside])
+            columns.append((np.arange(pixels) * subrays + sub)[inside])
+            values.append(np.full(inside.sum(), weight))
+    where = (np.concatenate(rows), np.concatenate(columns))
+    return sparse.csr_matrix((np.concatenate(values), where), shape=(pixels, pixels * subrays))
 
-    shape: tuple[int, int]
-    pixel_scale: float
 
-    @property
-    def subpixel_scale(self) -> float:
-        return self.pixel_scale / _OVERSAMPLING
+class StampBlur:
+    """Light on sub-pixels through the PSF, on a window of the image and ``outside`` pixels round it.
 
-    def high_resolution_axes(self) -> tuple[FloatArray, FloatArray]:
-        ny, nx = ((n + 2 * _MARGIN) * _OVERSAMPLING for n in self.shape)
-        return pixel_centres(nx, self.subpixel_scale), pixel_centres(ny, self.subpixel_scale)
+    ``x`` and ``y`` are the centres of the sub-pixels, ``side`` [arcsec] apart.
+    """
 
+    def __init__(
+        self, spline: FloatArray, x: FloatArray, y: FloatArray, scale: float, subrays: int, outside: int
+    ) -> None:
+        self.side = scale / subrays
+        self._outside, self._shape = outside, (y.size, x.size)
+        beyond = scale * np.arange(1, outside + 1)
+        offsets = ((np.arange(subrays) + 0.5) / subrays - 0.5) * scale
+        wide = [np.concatenate([axis[0] - beyond[::-1], axis, axis[-1] + beyond]) for axis in (x, y)]
+        self.x, self.y = (np.add.outer(axis, offsets).ravel() for axis in wide)
+        self._deposit_x, self._deposit_y = (deposit_matrix(axis.size, subrays) for axis in wide)
+        middle = spline.shape[0] // 2
+        columns, rows = (axis.size for axis in wide)
+        high, across = min(middle, rows - 1), min(middle, columns - 1)
+        self._fft_shape = (fft.next_fast_len(rows + high, real=True), fft.next_fast_len(columns + across, real=True))
+        kernel = np.zeros(self._fft_shape)
+        kernel[: 2 * high + 1, : 2 * across + 1] = spline[
+            middle - high : middle + high + 1, middle - across : middle + across + 1
+        ]
+        self._kernel = fft.rfft2(np.roll(kernel, (-high, -across), axis=(0, 1)))
 
-def _interpolated_psf(psf: FloatArray) -> FloatArray:
-    """The PSF at sub-pixel offsets, less the smoothing by a sub-pixel that the light has been through already."""
-    guard = 4
-    padded = np.pad(psf, guard)
-    n = padded.shape[0]
-    size = n * _OVERSAMPLING
-    frequencies = fft.fftfreq(n) / _OVERSAMPLING
-    spectrum = fft.fft2(padded) / np.outer(np.sinc(frequencies), np.sinc(frequencies))
-    fine = np.zeros((size, size), dtype=np.complex128)
-    half = n // 2
-    place = np.r_[0 : half + 1, size - half : size]
-    fine[np.ix_(place, place)] = spectrum
-    values = np.real(fft.ifft2(fine)) * _OVERSAMPLING**2
-    last = (n - 1) * _OVERSAMPLING + 1
-    return np.asarray(values[:last, :last])
+    def __call__(self, fine: FloatArray) -> FloatArray:
+        """Image (ny, nx) of the window from the flux of each sub-pixel."""
+        laid = (self._deposit_x @ (self._deposit_y @ fine).T).T
+        blurred = fft.irfft2(fft.rfft2(laid, self._fft_shape) * self._kernel, self._fft_shape)
+        k, (ny, nx) = self._outside, self._shape
+        return np.asarray(blurred[k : k + ny, k : k + nx])
 
 
 def lensed_sersic_image(
     observation: Observation, profile: SersicProfile, lens: PowerLawLens | None = None
 ) -> FloatArray:
     """Image (ny, nx) [e-/s per pixel] of a Sersic profile, behind a lens or not, in an observation."""
-    response = observation.response
-    geometry = _SubpixelGrid(observation.shape, observation.pixel_scale) if response is None else response.geometry
-    x, y = geometry.high_resolution_axes()
-    light = render_sersic(profile, x, y, geometry.subpixel_scale, lens)
+    if observation.response is None:
+        ny, nx = observation.shape
+        scale = observation.pixel_scale
+        axes = pixel_centres(nx, scale), pixel_centres(ny, scale)
+        blur = StampBlur(spline_coefficients(observation.psf), *axes, scale, _OVERSAMPLING, _OUTSIDE)
+        return blur(render_sersic(profile, blur.x, blur.y, blur.side, lens))
+    geometry = observation.response.geometry
+    light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens)
     if lens is None:
         cusps = [(profile.x, profile.y)]
     else:
         cusps = [(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)]
-    light = place_cusps(light, profile, cusps, geometry, lens)
-    if response is not None:
-        return response.extended_image(light)
-    blurred = convolve(light, _interpolated_psf(observation.psf))
-    first = _MARGIN * _OVERSAMPLING + _OVERSAMPLING // 2
-    ny, nx = observation.shape
-    return np.asarray(
-        blurred[first : first + ny * _OVERSAMPLING : _OVERSAMPLING, first : first + nx * _OVERSAMPLING : _OVERSAMPLING]
-    )
+    return observation.response.extended_image(place_cusps(light, profile, cusps, geometry, lens))

@@ -17,13 +17,14 @@ _START_ANGLES = 6
 
 
 def lens_from_positions(
-    positions: Sequence[tuple[float, float]], slope: float = 2.0
-) -> tuple[PowerLawLens, FloatArray]:
-    """An elliptical power law of fixed slope at the origin that brings the images together in the source plane.
+    positions: Sequence[tuple[float, float]], slope: float = 2.0, centre: tuple[float, float] = (0.0, 0.0)
+) -> tuple[PowerLawLens, FloatArray, float]:
+    """An elliptical power law of fixed slope about ``centre`` that brings the images together in the source plane.
 
     The misfit is the scatter of the mapped images, weighted by the square root of their magnification so that it
     measures distances in the image plane; a weak prior on q keeps doubles, which have fewer constraints than
-    parameters, from extreme shapes. The best of several starting angles is returned with its source position (2,).
+    parameters, from extreme shapes. The best of several starting angles is returned with its source position (2,)
+    and its misfit [arcsec rms].
 
     Raises
     ------
@@ -32,7 +33,7 @@ def lens_from_positions(
     """
     if len(positions) < 2:
         raise PosteriorError(f"agn: {len(positions)} images, at least two are needed to start a lens from")
-    x, y = np.array(positions).T
+    x, y = (np.array(positions) - np.array(centre)).T
     radius = float(np.mean(np.hypot(x, y)))
 
     def lens_of(values: FloatArray) -> PowerLawLens:
@@ -60,4 +61,5 @@ def lens_from_positions(
             best = fit
     if best is None:
         raise PosteriorError("lens: no start")
-    return lens_of(best.x), best.x[3:].copy()
+    misfit_rms = math.sqrt(2.0 * best.cost / len(positions))
+    return lens_of(best.x).with_values(x=centre[0], y=centre[1]), best.x[3:] + np.array(centre), misfit_rms

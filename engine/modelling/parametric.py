@@ -1,42 +1,82 @@
-"""A parametric model of the whole image: AGN images, deflector, ray-traced Sersic host and a background.
+"""A parametric fit of the whole image: AGN images, deflector, ray-traced Sersic host and a background.
 
-It supplies what the inversion keeps fixed (AGN positions, the deflector's shape) and where its posterior starts. The
-fluxes are linear and are solved for at every step (variable projection), the rest is a bounded least-squares problem.
+It supplies what the inversion keeps fixed (AGN positions, the deflector's shape) and where its posterior starts. Quick
+fits from several deterministic starts on a window of the image come first; the best are fitted to the whole of it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.optimize import least_squares
 
 from engine.conventions import FloatArray, pixel_centres
-from engine.errors import PosteriorError
-from engine.imaging.blurring import convolve
-from engine.imaging.extended import lensed_sersic_image
+from engine.errors import ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
-from engine.inversion.blurring import central_stamp, pixel_kernel
-from engine.lensing.power_law import PowerLawLens, source_position
-from engine.light.rendering import render_sersic, sample_lensed_sersic
+from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.modelling.lens_start import lens_from_positions
-from engine.modelling.point_sources import Detection, find_point_sources
+from engine.modelling.image_model import (
+    POSITION_ERROR,
+    ImageModel,
+    Layout,
+    components,
+    lens_of,
+    sersic_of,
+    weights_sigma,
+    window_round,
+)
+from engine.modelling.point_sources import Detection, candidate_point_sources
+from engine.modelling.starts import (
+    Start,
+    agn_hypotheses,
+    deflector_centre,
+    filled_image,
+    ring_radius,
+    starts_from_agn,
+    starts_from_arc,
+)
 
-_HOST_SUBRAYS = 3
-_KERNEL_RADIUS = 20
-_STAMP_ERROR = 0.03
-"""Error of a shifted PSF stamp as a fraction of the AGN's light: keeps the cores from driving the fit."""
+_QUICK_SUBRAYS, _SUBRAYS = 1, 2
+_QUICK_WINDOW = 1.6
+"""Half-width of the window of the quick fits in Einstein radii, to which a margin comes."""
+_QUICK_MARGIN = 0.5
+_QUICK_STEPS, _STEPS = 15, 40
+_STAMP_SHIFT = 0.003
+"""Error of a moved PSF stamp, as a shift [arcsec]: a drizzled pixel does not see its light where its centre is."""
+_STAMP_ERROR = 0.005
+"""And as a fraction of the AGN's light."""
+_STAMP_CORRELATION = 2.0
+"""Pixels over which the error of a stamp stays the same, as the standard deviation of a Gaussian."""
 _RESPONSE_ERROR = 0.002
 """The same where the exposures are known: what errors of position leave."""
-_POSITION_ERROR = 0.01
-"""Image-plane accuracy [arcsec] asked of the AGN images as images of one source."""
-_CORRECTIONS = 2
-"""Rounds in which the quick images of deflector and host are corrected by their exact ones."""
 _MAX_ELLIPTICITY = 0.6
+_CORRECTIONS = 2
+"""Rounds in which the images of deflector and host are corrected by those through the exposures, if these are known."""
+_MOST_CANDIDATES = 6
+_AGN_NUMBERS = (4, 3, 2, 0)
+_ARC_STARTS = 4
+_BORDER = 3
+_RADII, _LEAST_RADIUS = 3.0, 2.5
+"""The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
+_FEWEST_RADII = 2.2
+"""Einstein radii that are fitted even where stamps of AGN images end in them."""
+HOST_NAMES = ("flux", "r_eff", "n", "q", "phi", "x", "y")
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """How bad a fit may be: chi^2 per degree of freedom; farthest that an AGN image maps from the host [arcsec]."""
+
+    chi2_per_dof: float = 4.0
+    miss: float = 0.05
+
+
+GOOD_START = Acceptance()
 
 
 @dataclass(frozen=True)
@@ -44,8 +84,11 @@ class ParametricFit:
     """The best parametric model of an observation.
 
     ``host.flux`` and ``deflector.flux`` are the fitted fluxes [e-/s]; ``agn`` are the fitted positions and fluxes;
-    ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``; ``chi2`` counts all
-    valid pixels with the PSF error added to their noise.
+    ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
+    that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
+    chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
+    their noise and the error of the PSF, infinite where a pixel was not fitted. ``model`` and ``arc`` are images
+    (ny, nx) of everything and of the lensed host [e-/s].
     """
 
     lens: PowerLawLens
@@ -55,238 +98,456 @@ class ParametricFit:
     background: float
     lens_names: tuple[str, ...]
     lens_covariance: FloatArray
+    host_covariance: FloatArray
     chi2: float
     degrees_of_freedom: int
     evaluations: int
+    at_bound: tuple[str, ...]
+    model: FloatArray
+    arc: FloatArray
+    sigma: FloatArray
 
 
-def _ellipse(e1: float, e2: float) -> tuple[float, float]:
-    """(q, phi) of ellipticity components e = (1 - q)/(1 + q)."""
-    e = min(math.hypot(e1, e2), 0.9)
-    return (1.0 - e) / (1.0 + e), 0.5 * math.atan2(e2, e1)
+@dataclass(frozen=True)
+class _Solution:
+    """A minimum: the model it belongs to, its parameters and its cost (chi^2 and priors)."""
+
+    model: ImageModel
+    values: FloatArray
+    cost: float
+    evaluations: int
+    start: Start
 
 
-def _components(q: float, phi: float) -> tuple[float, float]:
-    e = (1.0 - q) / (1.0 + q)
-    return e * math.cos(2.0 * phi), e * math.sin(2.0 * phi)
-
-
-class _ImageModel:
-    """Whitened columns of the linear amplitudes as functions of the nonlinear parameters of each component.
-
-    The parameters are laid out as [AGN x, y ...][deflector 6][lens 6 or 8][host 6]; a component that the scene lacks
-    has none. Columns are remembered for the last few parameter values, because a numerical Jacobian changes one
-    component at a time.
-    """
-
-    def __init__(
-        self, observation: Observation, detections: Sequence[Detection], *, deflector: bool, shear: bool
-    ) -> None:
-        self.observation = observation
-        self.has_deflector = deflector
-        self.shear = shear
-        ny, nx = observation.image.shape
-        scale = observation.pixel_scale
-        self.x, self.y = pixel_centres(nx, scale), pixel_centres(ny, scale)
-        stamp = central_stamp(observation.psf, _KERNEL_RADIUS)
-        self.sampled_kernel = pixel_kernel(stamp, _HOST_SUBRAYS)
-        self.integrated_kernel = pixel_kernel(stamp, None)
-        psf_error = _STAMP_ERROR if observation.response is None else _RESPONSE_ERROR
-        agn_light = np.zeros((ny, nx))
-        for found in detections:
-            agn_light += found.flux * observation.point_source(found.x, found.y)
-        sigma = np.where(observation.valid, np.hypot(observation.noise, psf_error * agn_light), 1.0)
-        self.weight = np.where(observation.valid, 1.0 / sigma, 0.0).ravel()
-        self.observed = np.where(observation.valid, observation.image, 0.0).ravel() * self.weight
-        self.data = self.observed
-        self.n_agn = len(detections)
-        self.agn_size = 2 * self.n_agn
-        self.deflector_size = 6 if deflector else 0
-        self.lens_size = 8 if shear else 6
-        self._agn_column = lru_cache(maxsize=4 * max(self.n_agn, 1))(self._render_agn)
-        self._deflector_column = lru_cache(maxsize=4)(self._render_deflector)
-        self._host_column = lru_cache(maxsize=4)(self._render_host)
-
-    def _render_agn(self, x: float, y: float) -> FloatArray:
-        return self.observation.point_source(x, y).ravel() * self.weight
-
-    def _render_deflector(self, *values: float) -> FloatArray:
-        image = render_sersic(self.deflector_of(values), self.x, self.y, self.observation.pixel_scale, tolerance=1e-3)
-        return convolve(image, self.integrated_kernel).ravel() * self.weight
-
-    def _render_host(self, *values: float) -> FloatArray:
-        lens, host = self.lens_of(values[: self.lens_size]), self.host_of(values[self.lens_size :])
-        image = sample_lensed_sersic(host, lens, self.x, self.y, self.observation.pixel_scale, _HOST_SUBRAYS)
-        return convolve(image, self.sampled_kernel).ravel() * self.weight
-
-    def deflector_of(self, values: Sequence[float] | FloatArray, flux: float = 1.0) -> SersicProfile:
-        """The deflector's profile of its parameters ln r_eff, n, e1, e2, x, y."""
-        ln_r, n, e1, e2, x, y = map(float, values)
-        return SersicProfile(flux, math.exp(ln_r), n, *_ellipse(e1, e2), x, y)
-
-    def host_of(self, values: Sequence[float] | FloatArray, flux: float = 1.0) -> SersicProfile:
-        """The host's profile of its parameters ln r_eff, n, e1, e2, x, y."""
-        return self.deflector_of(values, flux)
-
-    def lens_of(self, values: Sequence[float] | FloatArray) -> PowerLawLens:
-        """The lens of its parameters theta_E, e1, e2, slope, x, y (and gamma1, gamma2)."""
-        theta_E, e1, e2, slope, x, y, *shear = map(float, values)
-        q, phi = _ellipse(e1, e2)
-        return PowerLawLens(theta_E, q, phi, slope, x, y, *shear)
-
-    def correct(self, values: FloatArray) -> None:
-        """Take off the data what the quick columns of deflector and host lack of their exact images at ``values``.
-
-        A fit to the corrected data with the quick columns is one with exact columns, as far as their error does not
-        change with the parameters (defect correction).
-        """
-        amplitudes, _ = self.amplitudes(values)
-        _, deflector, lens, host = self.split(values)
-        lensed = self.host_of(host, float(amplitudes[-2]))
-        defect = lensed_sersic_image(self.observation, lensed, self.lens_of(lens)).ravel() * self.weight
-        defect -= amplitudes[-2] * self._host_column(*lens.tolist(), *host.tolist())
-        if self.has_deflector:
-            light = self.deflector_of(deflector, float(amplitudes[-3]))
-            defect += lensed_sersic_image(self.observation, light).ravel() * self.weight
-            defect -= amplitudes[-3] * self._deflector_column(*deflector.tolist())
-        self.data = self.observed - defect
-
-    def split(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The parameter vector as AGN positions (k, 2), deflector, lens and host parameters."""
-        a, b = self.agn_size, self.agn_size + self.deflector_size
-        c = b + self.lens_size
-        return values[:a].reshape(-1, 2), values[a:b], values[b:c], values[c:]
-
-    def columns(self, values: FloatArray) -> FloatArray:
-        """Whitened columns (pixels, amplitudes): AGN images, deflector, host, background."""
-        agn, deflector, lens, host = self.split(values)
-        out = [self._agn_column(float(x), float(y)) for x, y in agn]
-        if self.has_deflector:
-            out.append(self._deflector_column(*deflector.tolist()))
-        out.append(self._host_column(*lens.tolist(), *host.tolist()))
-        out.append(self.weight)
-        return np.stack(out, axis=1)
-
-    def amplitudes(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Best amplitudes and whitened residuals."""
-        columns = self.columns(values)
-        size = np.sqrt((columns**2).sum(axis=0))
-        if not (size > 0).all():
-            raise PosteriorError("parametric model: a component puts no light on the image")
-        scaled = columns / size
-        best = np.linalg.solve(scaled.T @ scaled, scaled.T @ self.data)
-        return best / size, self.data - scaled @ best
-
-    def residuals(self, values: FloatArray) -> FloatArray:
-        """Whitened residuals, followed by the scatter of the AGN images mapped to the source plane."""
-        _, rest = self.amplitudes(values)
-        agn, _, lens_values, host = self.split(values)
-        if not self.n_agn:
-            return rest
-        bx, by = source_position(self.lens_of(lens_values), agn[:, 0], agn[:, 1])
-        scatter = np.concatenate([bx - host[4], by - host[5]]) / _POSITION_ERROR
-        return np.concatenate([rest, scatter])
-
-
-def _start_vector(
-    model: _ImageModel, detections: Sequence[Detection], lens: PowerLawLens, source: FloatArray
-) -> FloatArray:
-    values: list[float] = [coordinate for found in detections for coordinate in (found.x, found.y)]
-    if model.has_deflector:
-        values += [math.log(lens.theta_E), 4.0, 0.0, 0.01, 0.0, 0.0]
-    values += [lens.theta_E, *_components(lens.q, lens.phi), lens.slope, 0.0, 0.0]
-    values += [0.0, 0.0] if model.shear else []
-    values += [math.log(0.3 * lens.theta_E), 2.0, 0.0, 0.01, float(source[0]), float(source[1])]
+def _start_vector(layout: Layout, start: Start, centre: tuple[float, float]) -> FloatArray:
+    lens = start.lens
+    values: list[float] = [coordinate for found in start.agn for coordinate in (found.x, found.y)]
+    if layout.deflector:
+        values += [math.log(lens.theta_E), 4.0, 0.0, 0.01, *centre]
+    values += [lens.theta_E, *components(lens.q, lens.phi), lens.slope, lens.x, lens.y]
+    values += [lens.gamma1, lens.gamma2] if layout.shear else []
+    values += [math.log(start.host_radius * lens.theta_E), 2.0, 0.0, 0.01, *start.source]
     return np.array(values)
 
 
-def _bounds(model: _ImageModel, start: FloatArray, theta_E: float) -> tuple[FloatArray, FloatArray]:
-    scale = model.observation.pixel_scale
+def _bounds(layout: Layout, start: FloatArray, pixel_scale: float) -> tuple[FloatArray, FloatArray]:
     e = _MAX_ELLIPTICITY
-    half = [(value - 1.5 * scale, value + 1.5 * scale) for value in start[: model.agn_size].tolist()]
-    if model.has_deflector:
-        half += [(math.log(0.03), math.log(20.0)), (0.5, 9.0), (-e, e), (-e, e), (-0.3, 0.3), (-0.3, 0.3)]
-    half += [(0.5 * theta_E, 1.6 * theta_E), (-e, e), (-e, e), (1.3, 2.7), (-0.3, 0.3), (-0.3, 0.3)]
-    half += [(-0.4, 0.4), (-0.4, 0.4)] if model.shear else []
-    half += [(math.log(0.02), math.log(5.0)), (0.5, 8.0), (-e, e), (-e, e)]
-    half += [(start[-2] - theta_E, start[-2] + theta_E), (start[-1] - theta_E, start[-1] + theta_E)]
+    x, y = start[layout.lens_slice][4:6].tolist()
+    theta_E = float(start[layout.lens_slice][0])
+    near = [(x - 0.4, x + 0.4), (y - 0.4, y + 0.4)]
+    half = [(value - 2.0 * pixel_scale, value + 2.0 * pixel_scale) for value in start[: 2 * layout.n_agn].tolist()]
+    if layout.deflector:
+        half += [(math.log(0.03), math.log(20.0)), (0.5, 9.0), (-e, e), (-e, e), *near]
+    half += [(0.4 * theta_E, 1.8 * theta_E), (-e, e), (-e, e), (1.3, 2.7), *near]
+    half += [(-0.4, 0.4), (-0.4, 0.4)] if layout.shear else []
+    half += [(math.log(0.02), math.log(5.0)), (0.4, 8.5), (-e, e), (-e, e)]
+    half += [(x - theta_E, x + theta_E), (y - theta_E, y + theta_E)]
     low, high = np.array(half).T
     return low, high
 
 
-def _lens_covariance(model: _ImageModel, jacobian: FloatArray, values: FloatArray) -> FloatArray:
-    """Covariance of (theta_E, q, phi, slope, x, y, shear) from the inverse of J^T J, by the chain rule."""
-    scale = np.sqrt((jacobian**2).sum(axis=0))
-    scale[scale == 0.0] = 1.0
-    scaled = jacobian / scale
-    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12) / np.outer(scale, scale)
-    first = model.agn_size + model.deflector_size
-    block = slice(first, first + model.lens_size)
-    covariance = inverse[block, block]
-    _, e1, e2, *_ = values[block]
-    e = max(math.hypot(e1, e2), 1e-4)
-    chain = np.eye(model.lens_size)
-    slope_q = -2.0 / (1.0 + e) ** 2
-    chain[1, 1:3] = slope_q * e1 / e, slope_q * e2 / e
-    chain[2, 1:3] = -0.5 * e2 / e**2, 0.5 * e1 / e**2
-    return np.asarray(chain @ covariance @ chain.T)
+def _minimise(model: ImageModel, start: Start, values: FloatArray, steps: int, tolerance: float) -> _Solution:
+    low, high = _bounds(model.layout, values, model.observation.pixel_scale)
+    inside = np.clip(values, low + 1e-6, high - 1e-6)
+    fit = least_squares(
+        model.residuals, inside, model.jacobian, (low, high), x_scale="jac", xtol=tolerance, ftol=tolerance,
+        max_nfev=steps,
+    )  # fmt: skip
+    return _Solution(model, fit.x, 2.0 * float(fit.cost), int(fit.nfev), start)
+
+
+def _stamp_radius(psf: FloatArray) -> int:
+    """Pixels from the middle of a stamp to the nearest side of what is not padding."""
+    rows, columns = (np.flatnonzero(np.any(psf != 0, axis=axis)) for axis in (1, 0))
+    middle = psf.shape[0] // 2
+    return int(min(middle - rows[0], rows[-1] - middle, middle - columns[0], columns[-1] - middle))
+
+
+def _stamp_variance(observation: Observation, agn: Sequence[Detection]) -> FloatArray:
+    """Variance (ny, nx) of what the AGN images put on the pixels but no model of them can predict."""
+    variance = np.zeros(observation.shape)
+    scale = observation.pixel_scale
+    if not agn:
+        return variance
+    light = np.zeros(observation.shape)
+    for found in agn:
+        light += found.flux * observation.point_source(found.x, found.y)
+    if observation.response is not None:
+        return np.asarray((_RESPONSE_ERROR * light) ** 2)
+    steep = sum(np.asarray(slope) ** 2 for slope in np.gradient(light, scale))
+    return np.asarray((_STAMP_ERROR * light) ** 2 + _STAMP_SHIFT**2 * steep)
+
+
+def _refuse(options: dict[str, tuple[object, bool, str]]) -> None:
+    for name, (value, good, allowed) in options.items():
+        if not good:
+            raise SpecError(name, value, allowed)
 
 
 def fit_parametric(
-    observation: Observation, *, agn_images: int, deflector: bool = True, shear: bool = False
+    observation: Observation,
+    *,
+    agn_images: int | None = None,
+    deflector: bool = True,
+    shear: bool | None = False,
+    theta_E: float | None = None,
+    positions: Sequence[tuple[float, float]] | None = None,
+    acceptance: Acceptance = GOOD_START,
 ) -> ParametricFit:
-    """Find the AGN images and fit the parametric model, from nothing but the observation.
+    """Find lens, AGN images and host, from nothing but the observation.
 
     Parameters
     ----------
     observation : Observation
-    agn_images : int
-        Number of AGN images to look for.
-    deflector, shear : bool
-        Whether the deflector shines and whether the lens has external shear: a component that is absent is not built.
+    agn_images : int, optional
+        Number of AGN images; where None, four, three, two and none are tried and the least BIC decides.
+    deflector : bool
+        Whether the deflector shines: a component that is absent is not built.
+    shear : bool, optional
+        Whether the lens has external shear; where None it has where the BIC asks for it.
+    theta_E : float, optional
+        Rough Einstein radius [arcsec].
+    positions : sequence of (x, y), optional
+        Rough positions of the AGN images [arcsec, image frame]; then ``agn_images`` is their number.
+    acceptance : Acceptance
+        How bad a fit may be that is handed on.
 
     Raises
     ------
     ObservationError
         The AGN images are not found.
     PosteriorError
-        The fit has no acceptable solution.
+        No start leads to an acceptable fit; the message says what is wrong with the best.
     """
-    noise = np.where(observation.valid, observation.noise, np.median(observation.noise[observation.valid]))
-    detections = find_point_sources(
-        np.where(observation.valid, observation.image, 0.0), noise, observation.psf, observation.pixel_scale, agn_images
+    finder = _Finder(observation, deflector=deflector, acceptance=acceptance)
+    radius = min(observation.shape) * observation.pixel_scale / 2
+    _refuse(
+        {
+            "agn_images": (agn_images, agn_images is None or 0 <= agn_images <= 8, "a number from 0 to 8"),
+            "theta_E": (theta_E, theta_E is None or 0 < theta_E < radius, f"a radius on the image, below {radius:g}"),
+        }
     )
-    lens, source = lens_from_positions([(found.x, found.y) for found in detections])
-    model = _ImageModel(observation, detections, deflector=deflector, shear=shear)
-    start = _start_vector(model, detections, lens, source)
-    low, high = _bounds(model, start, lens.theta_E)
-    start = np.clip(start, low + 1e-6, high - 1e-6)
-    fit = least_squares(
-        model.residuals, start, bounds=(low, high), x_scale="jac", loss="linear", xtol=1e-6, ftol=1e-6, max_nfev=60
-    )
-    for _ in range(_CORRECTIONS):
-        model.correct(fit.x)
-        fit = least_squares(
-            model.residuals, fit.x, bounds=(low, high), x_scale="jac", xtol=1e-6, ftol=1e-6, max_nfev=20
+    groups = finder.starts(agn_images, theta_E, positions)
+    refusals: list[str] = []
+    for wave in (groups, [_varied(group) for group in groups]):
+        for solution in finder.ranked([finder.quick(group) for group in wave], shear=shear is not False):
+            try:
+                return finder.result(finder.polish(solution, shear=shear))
+            except PosteriorError as error:
+                refusals.append(str(error))
+    raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
+
+
+def _information(solution: _Solution) -> float:
+    """The BIC less what is common to all solutions on one image."""
+    return solution.cost + 3 * solution.model.layout.n_agn * math.log(solution.model.pixels)
+
+
+def _varied(group: list[Start]) -> list[Start]:
+    """More starts for where the first ones led nowhere: other slopes, a smaller and a larger host, shear."""
+    seeds = group if len(group) <= _ARC_STARTS else group[:: max(1, len(group) // _ARC_STARTS)]
+    out = []
+    for start in seeds:
+        for slope, radius in ((1.8, 0.3), (2.2, 0.3), (2.0, 0.1), (2.0, 0.6)):
+            lens = start.lens.with_values(slope=slope, gamma1=0.01)
+            out.append(replace(start, lens=lens, host_radius=radius))
+    return out
+
+
+class _Finder:
+    """The stages of the search for one observation."""
+
+    def __init__(self, observation: Observation, *, deflector: bool, acceptance: Acceptance) -> None:
+        self.observation, self.has_deflector, self.acceptance = observation, deflector, acceptance
+        self.image = filled_image(observation)
+        self.noise = np.where(
+            observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
         )
-    amplitudes, rest = model.amplitudes(fit.x)
-    agn, deflector_values, lens_values, host_values = model.split(fit.x)
-    host_flux, background = float(amplitudes[-2]), float(amplitudes[-1])
-    if not host_flux > 0:
-        raise PosteriorError(f"parametric model: the host's flux is {host_flux:.3g} e-/s, a positive one is needed")
-    names = ("theta_E", "q", "phi", "slope", "x", "y", *(("gamma1", "gamma2") if shear else ()))
-    return ParametricFit(
-        lens=model.lens_of(lens_values.tolist()),
-        host=model.host_of(host_values.tolist(), host_flux),
-        deflector=(model.deflector_of(deflector_values.tolist(), float(amplitudes[agn_images])) if deflector else None),
-        agn=tuple(
-            Detection(float(x), float(y), float(flux), found.significance)
-            for (x, y), flux, found in zip(agn, amplitudes[:agn_images], detections, strict=True)
-        ),
-        background=background,
-        lens_names=names,
-        lens_covariance=_lens_covariance(model, fit.jac, fit.x),
-        chi2=float(rest @ rest),
-        degrees_of_freedom=int(observation.valid.sum()) - fit.x.size - amplitudes.size,
-        evaluations=int(fit.nfev),
+        self.centre = deflector_centre(self.image, observation.pixel_scale) if deflector else (0.0, 0.0)
+        self.evaluations = 0
+
+    def _candidates(self, most: int) -> tuple[Detection, ...]:
+        observation = self.observation
+        return candidate_point_sources(
+            self.image, self.noise, observation.psf, observation.pixel_scale, most, self.centre
+        )
+
+    def starts(
+        self, number: int | None, theta_E: float | None, positions: Sequence[tuple[float, float]] | None
+    ) -> list[list[Start]]:
+        """Starts of each hypothesis about the AGN images."""
+        if positions is not None:
+            agn = tuple(Detection(float(x), float(y), self._flux_at(x, y), math.inf) for x, y in positions)
+            hypotheses = [agn]
+        else:
+            candidates = self._candidates(max(_MOST_CANDIDATES, number or 0))
+            if number is not None and len(candidates) < number:
+                raise ObservationError(f"agn: found {len(candidates)} point sources of {number}, at five sigma or more")
+            hypotheses = agn_hypotheses(candidates, _AGN_NUMBERS if number is None else (number,), self.centre)
+        groups = []
+        for agn in hypotheses:
+            if len(agn) >= 2:
+                groups.append(starts_from_agn(agn, self.centre))
+            else:
+                rough = theta_E or ring_radius(self.image, self.observation.pixel_scale, self.centre)
+                groups.append(starts_from_arc(rough, self.centre, agn))
+        return groups
+
+    def _fitted(self, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray[np.bool_]:
+        """Pixels (ny, nx) of the final fit: a circle.
+
+        Nobody knows what shines into the image's border; and where the stamp of an AGN image ends, its light does not.
+        """
+        scale, (ny, nx) = self.observation.pixel_scale, self.observation.shape
+        x, y = pixel_centres(nx, scale), pixel_centres(ny, scale)
+        frame = 0.5 * min(ny, nx) * scale - _BORDER * scale
+        reach = max((math.hypot(found.x - lens.x, found.y - lens.y) for found in agn), default=0.0)
+        stamp = max(_stamp_radius(self.observation.psf) * scale - reach, _FEWEST_RADII * lens.theta_E)
+        whole = not agn or self.observation.response is not None
+        radius = min(frame, frame if whole else stamp, max(_LEAST_RADIUS, _RADII * lens.theta_E))
+        return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
+
+    def _flux_at(self, x: float, y: float) -> float:
+        observation = self.observation
+        star = observation.point_source(x, y)
+        return max(float((star * self.image).sum() / (star * star).sum()), 0.0)
+
+    def quick(self, group: list[Start]) -> list[_Solution]:
+        """Quick fits from a group of starts, of which a long one is cut down by linear fits first."""
+        observation = self.observation
+        first = group[0]
+        reach = max(start.lens.theta_E for start in group)
+        reach = max([reach, *(math.hypot(d.x - self.centre[0], d.y - self.centre[1]) for d in first.agn)])
+        window = window_round(
+            observation.shape, observation.pixel_scale, self.centre, _QUICK_WINDOW * reach + _QUICK_MARGIN
+        )
+        layout = Layout(len(first.agn), self.has_deflector, shear=first.lens.gamma1 != 0.0)
+        # One noise map for all hypotheses, or their chi^2 could not be compared.
+        sigma = weights_sigma(observation, _stamp_variance(observation, self._candidates(4)))
+        model = ImageModel(observation, layout, sigma, window, subrays=_QUICK_SUBRAYS, exact=False)
+        if len(group) > 2 * _ARC_STARTS:
+            group = self._best_linear(model, group)
+        out = []
+        for start in group:
+            try:
+                found = _minimise(model, start, _start_vector(layout, start, self.centre), _QUICK_STEPS, 1e-4)
+            except PosteriorError:
+                continue
+            self.evaluations += found.evaluations
+            if model.amplitudes(found.values)[0][-2] > 0:
+                out.append(found)
+        return out
+
+    def _best_linear(self, model: ImageModel, group: list[Start]) -> list[Start]:
+        """The best starts by the linear fit alone, no two of them of the same lens."""
+        rated: list[tuple[float, int, Start]] = []
+        for start in group:
+            amplitudes, rest, _ = model.amplitudes(_start_vector(model.layout, start, self.centre))
+            if amplitudes[-2] > 0:
+                rated.append((float(rest @ rest), len(rated), start))
+        chosen: list[Start] = []
+        for _, _, start in sorted(rated):
+            if all(start.lens != other.lens for other in chosen):
+                chosen.append(start)
+            if len(chosen) == _ARC_STARTS:
+                break
+        return chosen
+
+    def ranked(self, groups: list[list[_Solution]], *, shear: bool) -> list[_Solution]:
+        """The two solutions to go on with, the better one first.
+
+        A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so solutions with and
+        without AGN are compared as fits of full accuracy, with ``shear`` where there may be some, on one noise map.
+        """
+        best = sorted((min(group, key=_information) for group in groups if group), key=_information)
+        if len(best) == 1:
+            return sorted(groups[0], key=_information)[:2]
+        rivals = [next((s for s in best if bool(s.model.layout.n_agn) is with_agn), None) for with_agn in (True, False)]
+        chosen = [solution for solution in rivals if solution is not None]
+        if len(chosen) < 2:
+            return best[:2]
+        sigma = self._sigma(chosen[0])
+        rated: list[tuple[float, int]] = []
+        for k, solution in enumerate(chosen):
+            layout = replace(solution.model.layout, shear=shear)
+            values = _with_shear(solution.values, solution.model.layout, shear=shear)
+            full = _minimise(self._model(layout, sigma), solution.start, values, _STEPS, 1e-4)
+            self.evaluations += full.evaluations
+            rated.append((_information(full), k))
+        return [chosen[k] for _, k in sorted(rated)]
+
+    def _sigma(self, quick: _Solution) -> FloatArray:
+        """Standard deviation of the pixels of the final fit, with the error of the AGN as they were quickly fitted."""
+        values, layout = quick.values, quick.model.layout
+        agn = _fitted_agn(layout, values, quick.model.amplitudes(values)[0], quick.start.agn)
+        sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
+        sigma[~self._fitted(lens_of(values[layout.lens_slice]), agn)] = np.inf
+        return sigma
+
+    def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
+        ny, nx = self.observation.shape
+        return ImageModel(self.observation, layout, sigma, (slice(0, ny), slice(0, nx)), subrays=_SUBRAYS, exact=True)
+
+    def polish(self, quick: _Solution, *, shear: bool | None) -> _Solution:
+        """The fit of the whole image from a quick one; with shear where it is wanted, or is worth its parameters."""
+        values, layout = quick.values, quick.model.layout
+        sigma = self._sigma(quick)
+
+        def model(with_shear: bool) -> ImageModel:
+            return self._model(replace(layout, shear=with_shear), sigma)
+
+        if shear:
+            best = _minimise(model(True), quick.start, _with_shear(values, layout, shear=True), _STEPS, 1e-6)
+        else:
+            best = _minimise(model(False), quick.start, _with_shear(values, layout, shear=False), _STEPS, 1e-6)
+            if shear is None:
+                beside = _with_shear(best.values, best.model.layout, shear=True)
+                other = _minimise(model(True), quick.start, beside, _STEPS, 1e-6)
+                self.evaluations += other.evaluations
+                if best.cost - other.cost > 2.0 * math.log(best.model.pixels):
+                    best = other
+        self.evaluations += best.evaluations
+        for _ in range(_CORRECTIONS if self.observation.response is not None else 0):
+            best.model.correct(best.values)
+            best = _minimise(best.model, best.start, best.values, _STEPS, 1e-6)
+            self.evaluations += best.evaluations
+        return best
+
+    def _shared(self, model: ImageModel, jacobian: FloatArray) -> FloatArray:
+        """J^T (C - diag C) J of the whitened Jacobian: what pixels share of their noise and of the stamps' error."""
+        shape, size = self.observation.shape, jacobian.shape[1]
+        noise = np.where(self.observation.valid, self.observation.noise, 0.0)
+        inside = np.where(np.isfinite(model.sigma), model.sigma, 0.0)
+        stamp = np.sqrt(np.maximum(inside**2 - noise**2, 0.0)) * (inside > 0)
+        out = np.zeros((size, size))
+        if self.observation.response is None and stamp.any():
+            moved = (jacobian.reshape(*shape, size) * (stamp.ravel() * model.weight).reshape(*shape, 1)).copy()
+            width = (_STAMP_CORRELATION, _STAMP_CORRELATION, 0.0)
+            # A Gaussian filter has unit sum; the correlation of a pixel with itself is one.
+            smooth = ndimage.gaussian_filter(moved, width, mode="constant") * (2.0 * math.pi * _STAMP_CORRELATION**2)
+            flat = moved.reshape(-1, size)
+            out += flat.T @ (smooth.reshape(-1, size) - flat)
+        if self.observation.covariance is not None:
+            shared = self.observation.covariance.copy()
+            shared.setdiag(0.0)
+            weighted = jacobian * model.weight[:, None]
+            out += weighted.T @ (shared @ weighted)
+        return 0.5 * (out + out.T)
+
+    def result(self, solution: _Solution) -> ParametricFit:
+        """The fit as it is handed on; a PosteriorError where it is no good."""
+        model, values, layout = solution.model, solution.values, solution.model.layout
+        jacobian, amplitudes = model.full_jacobian(values)
+        _, rest, _ = model.amplitudes(values)
+        chi2, freedom = float(rest @ rest), model.pixels - layout.size - layout.amplitudes
+        host = sersic_of(values[layout.host_slice], 1.0)
+        flux = float(amplitudes[-2])
+        if not flux > 0:
+            raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
+        if not freedom > 0 or chi2 > self.acceptance.chi2_per_dof * freedom:
+            raise PosteriorError(
+                f"parametric model: chi2 is {chi2:.0f} for {freedom} degrees of freedom, "
+                f"{self.acceptance.chi2_per_dof:g} times as many are allowed"
+            )
+        if layout.n_agn:
+            miss = POSITION_ERROR * float(np.abs(model.constraints(values)[-2 * layout.n_agn :]).max())
+            if miss > self.acceptance.miss:
+                raise PosteriorError(
+                    f"parametric model: an AGN image maps {miss:.3f} arcsec from the host, "
+                    f"{self.acceptance.miss:g} are allowed"
+                )
+        inflation = max(1.0, chi2 / freedom)
+        covariance = inflation * _covariance(jacobian, self._shared(model, jacobian[: model.data.size]))
+        shape = self.observation.shape
+        shown = ImageModel(self.observation, layout, np.ones(shape), model.window, subrays=_SUBRAYS, exact=True)
+        columns = shown.columns(values)
+        return ParametricFit(
+            lens=lens_of(values[layout.lens_slice]),
+            host=replace(host, flux=flux),
+            deflector=(
+                sersic_of(values[layout.deflector_slice], float(amplitudes[layout.n_agn])) if layout.deflector else None
+            ),
+            agn=_fitted_agn(layout, values, amplitudes, solution.start.agn),
+            background=float(amplitudes[-1]),
+            lens_names=layout.lens_names,
+            lens_covariance=_lens_block(layout, covariance, values),
+            host_covariance=_host_block(layout, covariance, values),
+            chi2=chi2,
+            degrees_of_freedom=freedom,
+            evaluations=self.evaluations,
+            at_bound=_at_bound(solution),
+            model=(columns @ amplitudes).reshape(shape),
+            arc=(columns[:, -2] * flux).reshape(shape),
+            sigma=model.sigma,
+        )
+
+
+def _with_shear(values: FloatArray, layout: Layout, *, shear: bool) -> FloatArray:
+    """Parameters of a layout, with or without those of the shear, which start at zero."""
+    stop = layout.lens_slice.stop
+    if layout.shear == shear:
+        return values
+    return np.insert(values, stop, [0.0, 0.0]) if shear else np.delete(values, [stop - 2, stop - 1])
+
+
+def _fitted_agn(
+    layout: Layout, values: FloatArray, amplitudes: FloatArray, found: Sequence[Detection]
+) -> tuple[Detection, ...]:
+    positions = values[: 2 * layout.n_agn].reshape(-1, 2)
+    return tuple(
+        Detection(float(x), float(y), float(flux), detection.significance)
+        for (x, y), flux, detection in zip(positions, amplitudes[: layout.n_agn], found, strict=True)
+    )
+
+
+def _covariance(jacobian: FloatArray, shared: FloatArray) -> FloatArray:
+    """Covariance of a least-squares fit whose residuals share ``shared`` = J^T (C - 1) J: H^-1 (H + shared) H^-1."""
+    scale = np.sqrt((jacobian**2).sum(axis=0))
+    scale[scale == 0.0] = 1.0
+    scaled = jacobian / scale
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)
+    joint = inverse + inverse @ (shared / np.outer(scale, scale)) @ inverse
+    return np.asarray(joint / np.outer(scale, scale))
+
+
+def _shape_chain(e1: float, e2: float) -> FloatArray:
+    """Derivatives of (q, phi) by the components of e = (1 - q)/(1 + q)."""
+    e = max(math.hypot(e1, e2), 1e-4)
+    slope = -2.0 / (1.0 + e) ** 2
+    return np.array([[slope * e1 / e, slope * e2 / e], [-0.5 * e2 / e**2, 0.5 * e1 / e**2]])
+
+
+def _lens_block(layout: Layout, covariance: FloatArray, values: FloatArray) -> FloatArray:
+    """Covariance of (theta_E, q, phi, slope, x, y, shear), by the chain rule."""
+    where = layout.lens_slice
+    chain = np.eye(where.stop - where.start)
+    chain[1:3, 1:3] = _shape_chain(*values[where][1:3].tolist())
+    return np.asarray(chain @ covariance[where, where] @ chain.T)
+
+
+def _host_block(layout: Layout, covariance: FloatArray, values: FloatArray) -> FloatArray:
+    """Covariance of (flux, r_eff, n, q, phi, x, y), by the chain rule."""
+    where = layout.host_slice
+    chosen = [layout.size + layout.amplitudes - 2, *range(where.start, where.stop)]
+    chain = np.eye(7)
+    chain[1, 1] = math.exp(float(values[where][0]))
+    chain[3:5, 3:5] = _shape_chain(*values[where][2:4].tolist())
+    return np.asarray(chain @ covariance[np.ix_(chosen, chosen)] @ chain.T)
+
+
+def _at_bound(solution: _Solution) -> tuple[str, ...]:
+    """Names of the parameters of host, lens and deflector that ended at a bound."""
+    layout, values = solution.model.layout, solution.values
+    low, high = _bounds(layout, values, solution.model.observation.pixel_scale)
+    names = [f"agn{k // 2 + 1}.{'xy'[k % 2]}" for k in range(2 * layout.n_agn)]
+    light = ("ln r_eff", "n", "e1", "e2", "x", "y")
+    names += [f"deflector.{name}" for name in light] if layout.deflector else []
+    names += ["lens.theta_E", "lens.e1", "lens.e2", "lens.slope", "lens.x", "lens.y"]
+    names += ["lens.gamma1", "lens.gamma2"] if layout.shear else []
+    names += [f"host.{name}" for name in light]
+    near = 1e-3 * (high - low)
+    return tuple(
+        name
+        for name, value, least, most, margin in zip(names, values, low, high, near, strict=True)
+        if not least + margin < value < most - margin
     )

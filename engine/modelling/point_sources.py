@@ -27,10 +27,11 @@ class Detection:
     significance: float
 
 
-def remove_deflector(image: FloatArray, pixel_scale: float) -> FloatArray:
-    """The image less the median over circles round its centre: point sources and arcs stay, the deflector goes."""
+def remove_deflector(image: FloatArray, pixel_scale: float, centre: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
+    """The image less the median over circles round ``centre``: point sources and arcs stay, the deflector goes."""
     y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
-    _, ring = np.unique(np.rint(np.hypot(x, y) / pixel_scale), return_inverse=True)
+    radius = np.hypot(x - centre[0], y - centre[1])
+    _, ring = np.unique(np.rint(radius / pixel_scale), return_inverse=True)
     medians = ndimage.median(image, labels=ring, index=np.arange(ring.max() + 1))
     return np.asarray(image - np.asarray(medians)[ring])
 
@@ -49,7 +50,12 @@ def _subpixel_peak(values: FloatArray, row: int, column: int) -> tuple[float, fl
 
 
 def find_point_sources(
-    image: FloatArray, noise: FloatArray, psf: FloatArray, pixel_scale: float, number: int
+    image: FloatArray,
+    noise: FloatArray,
+    psf: FloatArray,
+    pixel_scale: float,
+    number: int,
+    centre: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Detection, ...]:
     """The ``number`` most significant point sources, brightest first.
 
@@ -63,29 +69,46 @@ def find_point_sources(
         arcsec.
     number : int
         How many to find.
+    centre : pair of float
+        Of the deflector [arcsec].
 
     Raises
     ------
     ObservationError
         Fewer peaks stand out.
     """
-    rest = remove_deflector(image, pixel_scale)
+    found = candidate_point_sources(image, noise, psf, pixel_scale, number, centre)
+    if len(found) < number:
+        raise ObservationError(f"agn: found {len(found)} point sources of {number}, at five sigma or more")
+    return found
+
+
+def candidate_point_sources(
+    image: FloatArray,
+    noise: FloatArray,
+    psf: FloatArray,
+    pixel_scale: float,
+    most: int,
+    centre: tuple[float, float] = (0.0, 0.0),
+) -> tuple[Detection, ...]:
+    """At most ``most`` peaks of five sigma or more, brightest first; arguments as of :func:`find_point_sources`."""
+    rest = remove_deflector(image, pixel_scale, centre)
     core = central_stamp(psf, _FILTER_RADIUS)
     # With locally constant noise the matched filter's peak is flux * sum(core^2) and its noise sigma * |core|.
     template = core[::-1, ::-1] - core.mean()
     energy = float((core * template[::-1, ::-1]).sum())
     y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
-    allowed = np.hypot(x, y) > _CENTRE_RADIUS
+    allowed = np.hypot(x - centre[0], y - centre[1]) > _CENTRE_RADIUS
     border = _FILTER_RADIUS + 1
     allowed[:border] = allowed[-border:] = False
     allowed[:, :border] = allowed[:, -border:] = False
     level = float(np.median(noise)) * float(np.sqrt((template**2).sum()))
     found: list[Detection] = []
-    for _ in range(number):
+    for _ in range(most):
         filtered = convolve(rest, template)
         peaks = allowed & (filtered == ndimage.maximum_filter(filtered, size=3)) & (filtered > 5.0 * level)
         if not peaks.any():
-            raise ObservationError(f"agn: found {len(found)} point sources of {number}, at five sigma or more")
+            break
         row, column = np.unravel_index(int(np.argmax(np.where(peaks, filtered, -np.inf))), image.shape)
         peak_row, peak_column = _subpixel_peak(filtered, int(row), int(column))
         flux = float(filtered[row, column]) / energy
