@@ -10,7 +10,7 @@ if __name__ == "__main__":
     if settings.kind_of_cluster == "local":
         from service.dispatcher.nursery import open_nursery
 
-        # Before all else: it loads while this process does.
+        # Before all else, so that it loads while this process does; without this, dispatch() opens it.
         open_nursery()
     from service.dispatcher.process import dispatch
 

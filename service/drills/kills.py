@@ -82,6 +82,7 @@ class DispatcherKills(Drill):
             code = service.end()
             left = len(service.processes())
         repeats = executed.total() - len(executed)
+        given_back = found.outcomes.get("dispatcher_lost", 0)
         return Report(
             self.name,
             f"{self.runs} runs of {self.sleep_s:g} s, two local workers, {ground.backend}",
@@ -90,7 +91,7 @@ class DispatcherKills(Drill):
                 Figure("stored", found.stored),
                 Figure("executions that ended", executed.total()),
                 Figure("repeats", repeats),
-                Figure("attempts given back", found.outcomes.get("dispatcher_lost", 0)),
+                Figure("attempts given back", given_back),
                 Figure("kill to next result, median", quantile(gaps, 0.5), "s"),
                 Figure("kill to next result, longest", max(gaps), "s"),
                 Figure("wall time", took, "s"),

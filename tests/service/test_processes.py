@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -27,6 +28,13 @@ def stored_once(database: Database, grid_id: str) -> int:
         ids = list(connection.scalars(select(result.c.run_id).where(result.c.grid_id == grid_id)))
     assert len(ids) == len(set(ids))
     return len(ids)
+
+
+def handles(pid: int, number: int) -> bool:
+    """Whether a process has a handler of its own for a signal: before that it simply dies of it."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    caught = int(re.findall(r"^SigCgt:\s*(\w+)$", status, re.MULTILINE)[0], 16)
+    return bool(caught >> (number - 1) & 1)
 
 
 def kill_dispatcher(service: Serving) -> float:
