@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -116,8 +116,12 @@ def outcomes(database: Database) -> Counter[str]:
 
 def worker_processes(command: subprocess.Popen[bytes]) -> list[psutil.Process]:
     """The process that computes, below the nanny that ``dask worker`` is."""
-    below = psutil.Process(command.pid).children(recursive=True)
-    return [process for process in below if "resource_tracker" not in " ".join(process.cmdline())]
+    found = []
+    for process in psutil.Process(command.pid).children(recursive=True):
+        with suppress(psutil.Error):  # it may be gone by now
+            if "resource_tracker" not in " ".join(process.cmdline()):
+                found.append(process)
+    return found
 
 
 def _charged_or_replaced(database: Database, command: subprocess.Popen[bytes], pid: int) -> bool:
@@ -177,7 +181,7 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
         while not outcomes(database)["worker_lost"]:
             assert kills < 5, "a worker was killed five times and no run was charged"
             eventually(lambda: ready(2) and grids.grid(third).counts.leased >= 2, _PATIENCE_S, "runs in flight")
-            (victim, *_) = worker_processes(workers[0])
+            (victim, *_) = eventually(partial(worker_processes, workers[0]), _PATIENCE_S, "its process")
             victim.kill()
             kills += 1
             seen = partial(_charged_or_replaced, database, workers[0], victim.pid)
