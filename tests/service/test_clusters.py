@@ -124,9 +124,9 @@ def worker_processes(command: subprocess.Popen[bytes]) -> list[psutil.Process]:
     return found
 
 
-def _charged_or_replaced(database: Database, command: subprocess.Popen[bytes], pid: int) -> bool:
+def _is_replaced(command: subprocess.Popen[bytes], pid: int) -> bool:
     found = [process.pid for process in worker_processes(command)]
-    return bool(outcomes(database)["worker_lost"]) or bool(found and pid not in found)
+    return bool(found) and pid not in found
 
 
 def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs_is_survived(
@@ -184,12 +184,16 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
             (victim, *_) = eventually(partial(worker_processes, workers[0]), _PATIENCE_S, "its process")
             victim.kill()
             kills += 1
-            seen = partial(_charged_or_replaced, database, workers[0], victim.pid)
-            eventually(seen, _PATIENCE_S, "a charge or another worker")
+            replaced = partial(_is_replaced, workers[0], victim.pid)
+            eventually(
+                lambda replaced=replaced: outcomes(database)["worker_lost"] or (replaced() and ready(2)),
+                _PATIENCE_S,
+                "a charge or another worker",
+            )
         rest = (second, third)
         eventually(lambda: all(grids.grid(one).counts.done == 60 for one in rest), _PATIENCE_S, "the other grids")
         assert set(outcomes(database)) <= {"done", "worker_lost", "scheduler_lost", "forgotten"}
-        assert outcomes(database)["worker_lost"] == 1
+        assert 1 <= outcomes(database)["worker_lost"] <= kills
         assert outcomes(database)["done"] == 132
         dispatcher.terminate()
         assert dispatcher.wait(timeout=_PATIENCE_S) == 0
