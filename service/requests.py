@@ -16,10 +16,14 @@ from engine import (
     CameraChoice,
     Grid,
     GridRun,
+    LensEquationError,
+    LensSystem,
     NoiseLevel,
     Optics,
+    SpecError,
     SystemChoice,
     camera_names,
+    check_system,
     engine_digest,
     expand,
     load_camera,
@@ -117,8 +121,27 @@ def plan(request: GridRequest, max_runs: int) -> list[PlannedRun]:
         _limit(math.prod(len(values or ()) for values in lists) * request.replicates, max_runs)
     single = expand(_grid(request, replicates=1))
     _limit(len(single) * request.replicates, max_runs)
+    _check_own_systems(request)
     runs = single if request.replicates == 1 else expand(_grid(request, request.replicates))
     return [_planned(run) for run in runs]
+
+
+def _check_own_systems(request: GridRequest) -> None:
+    """Refuse here what every run would fail of: a system that has not the images its mass models make (a few ms each).
+
+    Those of the catalogue are as they have to be.
+    """
+    for place, system in enumerate(request.systems or ()):
+        if isinstance(system, LensSystem):
+            try:
+                check_system(system)
+            except SpecError as error:
+                raise SpecError(f"systems[{place}].{error.field}", error.value, error.allowed) from error
+            except LensEquationError as error:
+                models = f"systems[{place}].mass_models"
+                raise SpecError(
+                    models, sorted(system.mass_models), f"lenses whose images can be found: {error}"
+                ) from error
 
 
 def _limit(runs: int, allowed: int) -> None:

@@ -81,7 +81,7 @@ class Settings(LogSettings):
     kubernetes_image: str = "hostlens:latest"
     kubernetes_memory: str = "4Gi"
     window: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """Runs in flight at most; one per worker thread, or ``batch`` of them, where None."""
+    """Runs claimed at most; one per worker thread (or ``batch``), and one more where they are short, where None."""
     batch: Annotated[int, Field(ge=1, le=1000)] = 1
     """Runs that a worker thread is given at a time: more than one where runs take less than about a second."""
     worker_memory: str = "auto"

@@ -22,11 +22,11 @@ from service.settings import Settings
 from service.store.migrate import upgrade
 
 _LOG = logging.getLogger(__name__)
-_FIRST_DELAY_S = 0.2
+_FIRST_DELAY_S = 0.1
 _MAX_DELAY_S = 30.0
-_STEADY_S = 4.0
+_STEADY_S = 2.0
 """A child that has run for so long could start: when it ends, its next start is not put off."""
-_LOOK_S = 0.1
+_LOOK_S = 0.05
 
 
 @dataclass

@@ -13,10 +13,8 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster, Security
 
+from service.dispatcher.nursery import ONE_THREAD
 from service.settings import Settings
-
-ONE_THREAD = {f"{name}_NUM_THREADS": 1 for name in ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")}
-"""Environment of a worker: the queue keeps its cores busy, and threads below a run would only fight for them."""
 
 _OUR_RULES = {
     "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
@@ -60,6 +58,9 @@ def open_client(settings: Settings) -> Iterator[Any]:
                 client.run_on_scheduler(_first_death_is_ours())
                 yield client
             return
+        if settings.kind_of_cluster == "local":
+            # From the nursery, which the process that dispatches has opened.
+            dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
         cluster = _CLUSTERS[settings.kind_of_cluster](settings)
         try:
             with Client(cluster, set_as_default=False) as client:

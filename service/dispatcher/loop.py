@@ -9,6 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from threading import Event
@@ -18,6 +19,7 @@ from distributed import KilledWorker
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
 from service import logs
+from service.dispatcher.ahead import Ahead
 from service.dispatcher.attribution import Deaths
 from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, unstorable, worker_lost
 from service.dispatcher.heartbeat import Heartbeat
@@ -36,6 +38,8 @@ _MAX_BACK_OFF_S = 10.0
 _EMPTY_LOOKS = 3
 _GONE_S = 1.0
 _NO_WINDOW = 1_000_000
+_BRIEF_S = 10.0
+"""Where runs take less, the next are claimed before a worker is free: it waits 30 ms for the database otherwise."""
 
 
 @dataclass
@@ -77,6 +81,8 @@ class Dispatcher:
         self._endings: deque[Callable[[], object]] = deque()
         self._deaths: Deaths[Flight] = Deaths()
         self._slots = Slots(settings.worker_lifetime_s)
+        self._ahead = Ahead()
+        self._brief = False
         self._suspects: set[str] = set()
         """Engines for which a suspect waits."""
         self._back_off = 0.0
@@ -105,21 +111,25 @@ class Dispatcher:
 
     def drain(self) -> None:
         """Claim nothing more, and wait a little for what is about to end; a run that takes longer is handed back."""
+        self._give_back(self._ahead.take_where(lambda _: True), Outcome.HANDED_BACK)
         until = time.monotonic() + self._settings.drain_s
         while self._flights and self._pool.running and time.monotonic() < until and not self._heartbeat.lost.is_set():
             self._guarded(self._land_and_write, time.sleep)
 
     def hand_back(self, outcome: Outcome = Outcome.HANDED_BACK) -> None:
         """Write what has ended, give the rest back to the queue, uncharged; without the database both wait."""
+        waiting = self._ahead.take_where(lambda _: True)
         self._collect(0.001)
-        gone = [*self._flights.values(), *self._deaths.take_back()]
+        gone = [flight.lease for flight in (*self._flights.values(), *self._deaths.take_back())]
         self._flights.clear()
         self._slots.clear()
-        if gone:
-            _LOG.info("handing back %d runs: %s", len(gone), outcome)
-            leases = [flight.lease for flight in gone]
-            self._endings.append(partial(self._queue.hand_back, leases, outcome))
+        self._give_back([*gone, *waiting], outcome)
         self._write_endings()
+
+    def _give_back(self, leases: list[Lease], outcome: Outcome) -> None:
+        if leases:
+            _LOG.info("handing back %d runs: %s", len(leases), outcome)
+            self._endings.append(partial(self._queue.hand_back, leases, outcome))
 
     def _guarded(self, step: Callable[[], None], wait: Callable[[float], object]) -> None:
         """One step; where the database is away, a wait that grows."""
@@ -141,7 +151,7 @@ class Dispatcher:
         self._collect(_LOOK_S if busy else self._settings.poll_s)
         self._look_for_deaths()
         self._write_endings()
-        if self._is_due("cancel", _LOOK_S) and self._flights:
+        if self._is_due("cancel", _LOOK_S) and (self._flights or len(self._ahead)):
             self._stop_cancelled()
         if self._is_due("reconcile", self._settings.reconcile_s):
             self._reconcile()
@@ -165,10 +175,30 @@ class Dispatcher:
         for engine in {worker.engine for worker in workers}:
             mine = [worker for worker in workers if worker.engine == engine and worker.address not in old]
             self._fill_lane(engine, mine)
-            free = self._slots.free(mine)[: self._room()]
-            if free and self._queue.waiting(engine):
-                wanted = min(len(free) * self._settings.batch, self._room())
-                self._place(self._queue.claim(self._generation, wanted, engine), free)
+            free = len(self._slots.free(mine))
+            # As many again as there are threads: all of them may end in the same moment.
+            threads = free + (sum(worker.threads for worker in mine) if self._brief else 0)
+            wanted = min(threads * self._settings.batch - self._ahead.count(engine), self._room())
+            if wanted > 0 and self._queue.waiting(engine):
+                self._ahead.put(engine, self._queue.claim(self._generation, wanted, engine))
+            self._place_ahead(engine, mine)
+
+    def _place_ahead(self, engine: str, workers: list[Worker]) -> None:
+        """Give free workers what was claimed for them."""
+        free = self._slots.free(workers)
+        threads = sum(worker.threads for worker in workers)
+        self._place(self._ahead.take(engine, len(free), threads, self._settings.batch), free)
+
+    def _refill(self, tasks: list[str]) -> None:
+        """Give workers that have just ended these tasks the next, before their answers are fetched and stored."""
+        for flight in self._flights.values():
+            if flight.future.key in tasks and flight.future.status == "finished":
+                self._slots.release(flight.worker, flight.future.key)
+        workers = self._pool.workers() if len(self._ahead) else []
+        old = self._slots.outlived(workers, time.monotonic())
+        for engine in {worker.engine for worker in workers}:
+            mine = [worker for worker in workers if worker.engine == engine and worker.address not in old]
+            self._place_ahead(engine, mine)
 
     def _fill_lane(self, engine: str, workers: list[Worker]) -> None:
         """Give the next suspect a worker of its own."""
@@ -184,13 +214,13 @@ class Dispatcher:
             self._place(self._queue.claim(self._generation, 1, engine, suspects=True), [lane])
 
     def _room(self) -> int:
-        """How many more runs may be in flight, whatever the workers have room for."""
+        """How many more runs may be claimed, whatever the workers have room for."""
         window = self._settings.window
-        return max((window or _NO_WINDOW) - len(self._flights), 0)
+        return max((window or _NO_WINDOW) - len(self._flights) - len(self._ahead), 0)
 
     def _place(self, leases: list[Lease], workers: list[Worker]) -> None:
         """Give each worker its part of the runs, as one task."""
-        size = math.ceil(len(leases) / len(workers))
+        size = math.ceil(len(leases) / max(len(workers), 1))
         for start, worker in zip(range(0, len(leases), max(size, 1)), workers, strict=False):
             batch = leases[start : start + size]
             self._slots.take(worker.address, batch[0].key, alone=batch[0].suspect)
@@ -208,13 +238,23 @@ class Dispatcher:
     def _collect(self, wait_s: float) -> None:
         """Turn runs that Dask has ended into endings, waiting for the first of them; results make one ending."""
         results: list[tuple[Lease, ResultPayload]] = []
-        try:
-            self._land(self._done.get(timeout=wait_s), results)
+        tasks = self._ended(wait_s)
+        while tasks:
+            self._refill(tasks)
+            for task in tasks:
+                self._land(task, results)
+            tasks = self._ended(0.0)
+        if results:
+            self._endings.append(partial(self._store, results))
+
+    def _ended(self, wait_s: float) -> list[str]:
+        """Dask tasks that have ended since the last look, after a wait for the first of them."""
+        tasks: list[str] = []
+        with suppress(queues.Empty):
+            tasks.append(self._done.get(block=wait_s > 0.0, timeout=wait_s))
             while True:
-                self._land(self._done.get_nowait(), results)
-        except queues.Empty:
-            if results:
-                self._endings.append(partial(self._store, results))
+                tasks.append(self._done.get_nowait())
+        return tasks
 
     def _land(self, task: str, results: list[tuple[Lease, ResultPayload]]) -> None:
         """End the runs of a Dask task; what there is to store comes to ``results``."""
@@ -235,6 +275,7 @@ class Dispatcher:
                 return  # the worker went before its answer was fetched: a later look finds out what is left
             except Exception as broken:  # noqa: BLE001 - the answer came from another process and may be anything
                 error = broken
+        self._brief = time.monotonic() - flights[0].started < _BRIEF_S
         for flight in flights:
             self._remove(flight.lease.key)
         if error is not None and len(flights) > 1:
@@ -337,6 +378,9 @@ class Dispatcher:
             # First the database, then the worker: whatever comes back now finds its lease gone.
             self._queue.cancel_leased(self._flights[key].lease)
         self._stop_workers_of([self._remove(key) for key in stopped])
+        for lease in [lease for lease in self._ahead if lease.run_id in cancelled]:
+            self._queue.cancel_leased(lease)
+        self._ahead.take_where(lambda lease: lease.run_id in cancelled)
 
     def _stop_workers_of(self, flights: list[Flight]) -> None:
         """End what no longer has a lease; runs beside it on the same worker go back when the worker is gone."""
@@ -364,9 +408,11 @@ class Dispatcher:
             elif flight.future.done():
                 self._done.put(flight.future.key)  # in case the callback was lost
         self._stop_workers_of(overdue_flights)
+        carried = set() if stranded else set(self._heartbeat.engines)
+        self._give_back(self._ahead.take_engines_but(carried), Outcome.FORGOTTEN)
         self._write_endings()
-        known = [*self._flights.values(), *self._deaths.waiting]
-        self._queue.requeue_forgotten(self._generation, [flight.lease.run_id for flight in known])
+        known = [flight.lease for flight in (*self._flights.values(), *self._deaths.waiting)]
+        self._queue.requeue_forgotten(self._generation, [lease.run_id for lease in (*known, *self._ahead)])
 
     def _is_due(self, what: str, every_s: float) -> bool:
         if time.monotonic() < self._due.get(what, 0.0):

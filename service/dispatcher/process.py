@@ -16,6 +16,7 @@ from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.holder import is_dead, own_name
 from service.dispatcher.loop import Dispatcher
 from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
+from service.dispatcher.nursery import open_nursery
 from service.dispatcher.pool import Pool, open_pool
 from service.process import stop_with_parent
 from service.settings import Settings
@@ -43,6 +44,8 @@ def dispatch(settings: Settings) -> int:
     signal.signal(signal.SIGINT, on_signal)
     stop_with_parent()
     settings.make_folders()
+    if settings.kind_of_cluster == "local":
+        open_nursery()
     metrics = DispatcherMetrics()
     with metrics.serving(settings):
         return _dispatch(settings, metrics, stop)

@@ -9,7 +9,8 @@ from typing import Any, NoReturn
 
 import dask.config
 
-from service.dispatcher.clusters import ONE_THREAD, dask_config
+from service.dispatcher.clusters import dask_config
+from service.dispatcher.nursery import ONE_THREAD
 from service.settings import Settings
 
 _DEATH_TIMEOUT_S = 60

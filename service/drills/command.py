@@ -22,6 +22,7 @@ from service.drills.requests import Cancel, Idempotency
 from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from service.drills.scale import Overhead, Throughput
 from service.drills.volume import Listing, Submission
+from service.drills.workers import Lifetime, SilentWorker
 
 DRILLS: dict[str, type[Drill]] = {
     drill.name: drill
@@ -33,6 +34,8 @@ DRILLS: dict[str, type[Drill]] = {
         SqliteLock,
         DiskFull,
         StoppedWorker,
+        SilentWorker,
+        Lifetime,
         TwoDispatchers,
         Poison,
         Cancel,

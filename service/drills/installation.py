@@ -48,6 +48,19 @@ def eventually(look: Callable[[], T], timeout_s: float = 30.0, what: str = "it")
     raise DrillError(f"{what} did not happen within {timeout_s:g} s")
 
 
+def is_worker(process: psutil.Process) -> bool:
+    """Whether a Dask nanny started this process: on its own, or had it forked from the dispatcher's nursery."""
+    if "--multiprocessing-fork" in process.cmdline():
+        return True
+    parent = process.parent()
+    return _is_nursery(process) and parent is not None and _is_nursery(parent)
+
+
+def _is_nursery(process: psutil.Process) -> bool:
+    # What is forked has its parent's command line.
+    return any("multiprocessing.forkserver" in argument for argument in process.cmdline())
+
+
 class Installation:
     """A supervised service and whatever else a drill starts beside it.
 
@@ -150,11 +163,11 @@ class Installation:
         return None
 
     def workers(self) -> list[psutil.Process]:
-        """The processes that compute: those that a Dask nanny has spawned."""
+        """The processes that compute."""
         found = []
         for process in self.processes():
             with suppress(psutil.Error):
-                if "--multiprocessing-fork" in process.cmdline():
+                if is_worker(process):
                     found.append(process)
         return found
 

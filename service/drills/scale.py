@@ -12,7 +12,7 @@ from typing import ClassVar
 import psutil
 
 from service.drills.drill import Drill, Ground, body
-from service.drills.installation import Installation, installation
+from service.drills.installation import Installation, installation, is_worker
 from service.drills.records import records
 from service.drills.remote import working_time
 from service.drills.report import Claim, Figure, Report, quantile
@@ -57,7 +57,7 @@ def cpu_seconds(service: Installation) -> dict[str, float]:
     for process in service.processes():
         with suppress(psutil.Error):
             command = process.cmdline()
-            kind = "worker" if "--multiprocessing-fork" in command else command[2].rpartition(".")[2]
+            kind = "worker" if is_worker(process) else command[2].rpartition(".")[2]
             times = process.cpu_times()
             spent[kind] = spent.get(kind, 0.0) + times.user + times.system
     return {kind: seconds for kind, seconds in spent.items() if kind in {"api", "timed_dispatcher", "worker"}}

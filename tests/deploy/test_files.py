@@ -19,7 +19,7 @@ import typer
 import yaml
 
 from service.cli import app
-from service.dispatcher.clusters import ONE_THREAD
+from service.dispatcher.nursery import ONE_THREAD
 from service.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore

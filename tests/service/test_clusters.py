@@ -8,7 +8,8 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import psutil
@@ -115,8 +116,17 @@ def outcomes(database: Database) -> Counter[str]:
 
 def worker_processes(command: subprocess.Popen[bytes]) -> list[psutil.Process]:
     """The process that computes, below the nanny that ``dask worker`` is."""
-    below = psutil.Process(command.pid).children(recursive=True)
-    return [process for process in below if "resource_tracker" not in " ".join(process.cmdline())]
+    found = []
+    for process in psutil.Process(command.pid).children(recursive=True):
+        with suppress(psutil.Error):  # it may be gone by now
+            if "resource_tracker" not in " ".join(process.cmdline()):
+                found.append(process)
+    return found
+
+
+def _is_replaced(command: subprocess.Popen[bytes], pid: int) -> bool:
+    found = [process.pid for process in worker_processes(command)]
+    return bool(found) and pid not in found
 
 
 def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs_is_survived(
@@ -164,16 +174,27 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
         eventually(lambda: ready(2), _PATIENCE_S, "two workers again")
         assert dispatcher.poll() is None
 
-        # A worker that is killed charges the one run that was on it; the nanny starts it anew.
-        before = outcomes(database)
-        eventually(lambda: grids.grid(second).counts.leased == 2, _PATIENCE_S, "two runs in flight")
-        (victim, *_) = worker_processes(workers[0])
-        victim.kill()
-        eventually(lambda: outcomes(database)["worker_lost"] == before["worker_lost"] + 1, _PATIENCE_S, "the charge")
-        eventually(lambda: grids.grid(second).counts.done == 60, _PATIENCE_S, "the second grid")
+        # A worker that is killed charges the one run that was on it; the nanny starts it anew. In the moment of the
+        # kill it may be between two runs, and nobody is charged: then again.
+        third = submit(grids, 60, seed=200)
+        kills = 0
+        while not outcomes(database)["worker_lost"]:
+            assert kills < 5, "a worker was killed five times and no run was charged"
+            eventually(lambda: ready(2) and grids.grid(third).counts.leased >= 2, _PATIENCE_S, "runs in flight")
+            (victim, *_) = eventually(partial(worker_processes, workers[0]), _PATIENCE_S, "its process")
+            victim.kill()
+            kills += 1
+            replaced = partial(_is_replaced, workers[0], victim.pid)
+            eventually(
+                lambda replaced=replaced: outcomes(database)["worker_lost"] or (replaced() and ready(2)),
+                _PATIENCE_S,
+                "a charge or another worker",
+            )
+        rest = (second, third)
+        eventually(lambda: all(grids.grid(one).counts.done == 60 for one in rest), _PATIENCE_S, "the other grids")
         assert set(outcomes(database)) <= {"done", "worker_lost", "scheduler_lost", "forgotten"}
-        assert outcomes(database)["worker_lost"] == 1
-        assert outcomes(database)["done"] == 72
+        assert 1 <= outcomes(database)["worker_lost"] <= kills
+        assert outcomes(database)["done"] == 132
         dispatcher.terminate()
         assert dispatcher.wait(timeout=_PATIENCE_S) == 0
 

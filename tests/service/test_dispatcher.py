@@ -307,6 +307,63 @@ def test_short_runs_go_several_at_a_time_and_a_death_among_them_charges_only_the
     assert ended == {"done": 9, "suspected": 4, "worker_lost": 3}
 
 
+def test_the_next_short_run_is_given_to_its_worker_before_the_last_one_is_stored(
+    database: Database, tmp_path: Path
+) -> None:
+    class Noted(InstantPool):
+        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+            setting.queue.events.append("submit")
+            return super().submit(leases, worker)
+
+    setting = Setting(database, Noted(tmp_path), runs=6)
+    setting.run()
+    first, then = ["claim", *["submit"] * 2, "store"], ["claim", *["submit"] * 4, "store"]
+    assert setting.queue.events == first + then
+    assert setting.grids.grid(setting.grid_id).counts.done == 6
+
+
+@pytest.fixture
+def ahead(database: Database, tmp_path: Path) -> Setting:
+    """Two runs on workers, and two that were claimed for when these are done."""
+    pool = InstantPool(tmp_path, *["pending"] * 2)
+    setting = Setting(database, pool, runs=6, engine=engine_digest(), reconcile_s=0.02)
+    setting.dispatcher._brief = True
+    setting.run(until=lambda: len(setting.pool.submitted) == 2)
+    assert (setting.grids.grid(setting.grid_id).counts.leased, len(setting.pool.submitted)) == (4, 2)
+    return setting
+
+
+def test_runs_claimed_ahead_are_cancelled_with_their_grid(ahead: Setting) -> None:
+    ahead.grids.cancel(ahead.grid_id)
+    ahead.run()
+    assert ahead.grids.grid(ahead.grid_id).counts.cancelled == 6
+    assert len(ahead.pool.submitted) == 2
+
+
+def test_a_stop_hands_back_what_was_claimed_ahead_and_starts_nothing_more(ahead: Setting, tmp_path: Path) -> None:
+    for future in ahead.pool.futures:
+        future.finish(tmp_path)
+    ahead.dispatcher.drain()
+    ahead.dispatcher.hand_back()
+    counts = ahead.grids.grid(ahead.grid_id).counts
+    assert (counts.done, counts.queued, len(ahead.pool.submitted)) == (2, 4, 2)
+
+
+def test_runs_claimed_ahead_go_back_where_no_worker_carries_their_engine_any_more(ahead: Setting) -> None:
+    ahead.pool.engine = "e" * 64
+    ahead.run(until=lambda: ahead.grids.grid(ahead.grid_id).counts.leased == 2)
+    assert sorted(outcomes(ahead)) == [[], [], [], [], ["forgotten"], ["forgotten"]]
+
+
+def test_a_dead_worker_charges_no_run_that_was_claimed_ahead(ahead: Setting, tmp_path: Path) -> None:
+    ahead.pool.futures[0].kill()
+    ahead.run(until=lambda: len(ahead.pool.submitted) > 2)
+    for future in ahead.pool.futures:
+        future.finish(tmp_path)
+    ahead.run(steps=2000)
+    assert sorted(outcomes(ahead)) == [["done"]] * 5 + [["worker_lost", "done"]]
+
+
 def test_one_result_that_the_database_refuses_keeps_no_other_out(database: Database, tmp_path: Path) -> None:
     class Fussy(ShakyQueue):
         def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:

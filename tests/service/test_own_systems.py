@@ -67,6 +67,7 @@ def test_an_own_camera_takes_the_place_of_the_systems(api: TestClient) -> None:
         ({"systems": [own(colour="red")]}, "/systems/0/colour", "nexpected"),
         ({"systems": [own(mass_models={})]}, "/systems/0/mass_models", "at least 1"),
         ({"systems": [own(agn=OWN["agn"][:1] * 2)]}, "/systems/0", "images of different names"),
+        ({"systems": [own(name="a"), own(agn=OWN["agn"][:3])]}, "/systems/1/agn", "4 images, as many as mass_models."),
         ({"systems": [7]}, "/systems/0", "dictionary"),
         ({"systems": [OWN, OWN]}, "/systems", "without repeated values"),
         ({"systems": [own(camera="none")]}, "/camera", "WFC3-IR_F160W"),
