@@ -298,7 +298,7 @@ def measure_image(
     estimates = [_parametric_estimate(fit, observation.zero_point, inflation)]
     lens = _lens_of_fit(fit, inflation)
     if found is not None:
-        estimates += [_host_estimate(estimate) for estimate in found.estimates if estimate.index_prior == "free"]
+        estimates += [_host_estimate(estimate) for estimate in found.estimates if estimate.index_prior == "wide"]
         warnings += found.warnings
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     by_name = {estimate.estimator: estimate for estimate in estimates}
@@ -308,11 +308,13 @@ def measure_image(
         warnings.append(f"model: chi2 per degree of freedom is {chi2:.2f}; the errors do not cover what it misses")
     elif found is not None and found.chain.summary.status != "converged":
         status = "not_converged"
+    host = next(by_name[name] for name in RECOMMENDED if name in by_name)
+    by_inversion = None if found is None else _lens_of_chain(found.lens)
     return ImageMeasurement(
-        host=next(by_name[name] for name in RECOMMENDED if name in by_name),
+        host=host,
         estimates=tuple(estimates),
-        lens=lens,
-        lens_by_inversion=None if found is None else _lens_of_chain(found.lens),
+        lens=lens if by_inversion is None or host.estimator == "parametric" else by_inversion,
+        lens_by_inversion=by_inversion,
         agn=tuple(
             AgnPosition(image.x, image.y, rate_to_magnitude(image.flux, observation.zero_point))
             for image in fit.agn

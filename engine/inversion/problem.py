@@ -76,10 +76,14 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
 
 
 def _noise(
-    observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
+    observation: Observation, fit: ParametricFit, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
 ) -> FloatArray | sparse.csr_matrix:
     """Variances (M,) or covariance (M, M, sparse) of the data on the mask under the chosen treatment, cores boosted."""
     variance = observation.noise[mask] ** 2
+    if observation.response is None:
+        # Where stars are moved stamps, the fit knows how wrong they are.
+        known = np.isfinite(fit.sigma[mask])
+        variance = np.where(known, np.maximum(variance, fit.sigma[mask] ** 2), variance)
     boost = np.where(core[mask], variance * CORE_BOOST**2, 0.0)
     if analysis.noise_treatment == "covariance":
         if observation.covariance is None:
@@ -172,7 +176,7 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
         rays = replace(rays, centre=(image.x, image.y))
     linear = LinearData(
         data=observation.image[mask],
-        covariance=_noise(observation, analysis, mask, core),
+        covariance=_noise(observation, fit, analysis, mask, core),
         columns=np.ascontiguousarray(images[:, mask].T),
     )
     operator = build_operator(linear, blurring, rays)

@@ -8,6 +8,7 @@ from engine.scene import Scene
 
 
 def true_fit(scene: Scene) -> ParametricFit:
+    shape = (scene.system.exposures.field_pixels,) * 2
     names = ("theta_E", "q", "phi", "slope", "x", "y")
     return ParametricFit(
         lens=scene.lens,
@@ -17,6 +18,11 @@ def true_fit(scene: Scene) -> ParametricFit:
         background=0.0,
         lens_names=names,
         lens_covariance=1e-6 * np.eye(len(names)),
+        host_covariance=1e-6 * np.eye(7),
+        at_bound=(),
+        model=np.zeros(shape),
+        arc=np.zeros(shape),
+        sigma=np.full(shape, np.inf),
         chi2=0.0,
         degrees_of_freedom=1,
         evaluations=0,
