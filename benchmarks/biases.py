@@ -3,8 +3,8 @@
     python -m benchmarks.biases [--systems HE0435 ...] [--profile standard] [--processes 2] [--results FILE]
 
 n of 2 and 4, both radii, three magnitudes, l_eta = 1.0, one seed each. Each run is appended to the results file as it
-ends, and one that is there already (by the digest of its specification and of the engine) is not repeated. The tables go
-to docs/tables/biases.md.
+ends, and one that is there already (by the digest of its specification and of the engine) is not repeated. The tables
+go to docs/tables/biases.md.
 """
 
 from __future__ import annotations
@@ -123,17 +123,17 @@ def table(records: list[dict[str, Any]], profile: str) -> str:
     lines = [
         "# Biases on the paper's grid",
         "",
-        "Written by `python -m benchmarks.biases`. Recovered minus true; ± is the standard deviation that the run itself",
+        "Written by `python -m benchmarks.biases`. Recovered minus true; ± is the standard deviation that the run",
         f"states. l_eta 1.0, profile `{profile}`, one noise realization each, n free in 0.3-8 (`wide`).",
         f"{len(good)} of {len(records)} runs have a result; "
-        f"{sum(r['status'] != 'converged' for r in good)} chains are shorter than 50 autocorrelation times. CPU time of "
-        f"a run: median {np.median([r['cpu_seconds'] for r in good]):.0f} s, "
+        f"{sum(r['status'] != 'converged' for r in good)} chains are shorter than 50 autocorrelation times. CPU time "
+        f"of a run: median {np.median([r['cpu_seconds'] for r in good]):.0f} s, "
         f"longest {max(r['cpu_seconds'] for r in good):.0f} s. Engine `{engine_digest()[:12]}`.",
         "",
         "## Summary",
         "",
-        f"Arcs brighter than {BRIGHT_ARC:g} mag in the image plane, and fainter ones. The last two columns are the share "
-        "of runs whose truth lies within one and within 1.96 stated deviations.",
+        f"Arcs brighter than {BRIGHT_ARC:g} mag in the image plane, and fainter ones. The last two columns are the "
+        "share of runs whose truth lies within one and within 1.96 stated deviations.",
         "",
     ]
     for quantity, unit in (("magnitude", "mag"), ("r_eff", "arcsec"), ("n", "")):

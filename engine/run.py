@@ -30,7 +30,7 @@ from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Target, flat_prior
 from engine.refits.draws import DrawSet, source_draw
-from engine.refits.estimators import refit_draws
+from engine.refits.estimators import Refit, refit_draws
 from engine.refits.profiles import profile_on_grid
 from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import (
@@ -82,6 +82,7 @@ class Measurement:
     """What the analysis of an observation finds."""
 
     estimates: tuple[Estimate, ...]
+    refits: tuple[Refit, ...]
     aperture: Aperture | None
     lens: tuple[LensParameter, ...]
     chain: Chain
@@ -149,10 +150,10 @@ def _refit(
     truth: Truth | None,
     fixed_index: float | None,
     rng: np.random.Generator,
-) -> tuple[tuple[Estimate, ...], Aperture | None, list[str]]:
-    """Estimates, aperture magnitude, and a warning for each of them that is not there."""
+) -> tuple[tuple[Refit, ...], tuple[Estimate, ...], Aperture | None, list[str]]:
+    """Fits, estimates, aperture magnitude, and a warning for each of them that is not there."""
     host = truth.host if truth else None
-    refits = refit_draws(drawn, ESTIMATORS, fixed_index, rng)
+    refits = tuple(refit_draws(drawn, ESTIMATORS, fixed_index, rng))
     summaries = [summarise(refit, zero_point, host) for refit in refits]
     warnings = [
         f"{refit.estimator} estimator, n {refit.index_prior}: not one of {len(refit.fits)} draws could be fitted"
@@ -163,7 +164,7 @@ def _refit(
     aperture = summarise_aperture(drawn.draws, on_maps, zero_point, host)
     if aperture is None:
         warnings.append("aperture: no drawn source has light within it")
-    return tuple(summary for summary in summaries if summary is not None), aperture, warnings
+    return refits, tuple(summary for summary in summaries if summary is not None), aperture, warnings
 
 
 def measure(
@@ -238,7 +239,7 @@ def measure(
         products, chi2 = _products(observation, problem, best, target, chain, truth)
     with watch.stage("refit"):
         drawn = DrawSet(problem.operator, tuple(draws))
-        estimates, aperture, warnings = _refit(drawn, observation.zero_point, truth, fixed_index, rng)
+        refits, estimates, aperture, warnings = _refit(drawn, observation.zero_point, truth, fixed_index, rng)
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
@@ -249,6 +250,7 @@ def measure(
     fitted = int((problem.mask & ~problem.core).sum())
     return Measurement(
         estimates=estimates,
+        refits=refits,
         aperture=aperture,
         lens=_lens_parameters(target, chain, truth),
         chain=chain,
