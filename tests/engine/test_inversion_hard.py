@@ -14,12 +14,11 @@ from engine.inversion.problem import prepare_problem
 from engine.inversion.regularisation import SourceModel, regularisation_matrix
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.modelling.parametric import ParametricFit
 from engine.scene import Scene
 from engine.simulation import Simulation
 from engine.spec import Analysis
 from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_operator
-from tests.engine.true_fit import true_fit
+from tests.engine.true_fit import bare_fit, true_fit
 
 MODEL = SourceModel((11, 12), "curvature", 0.5)
 
@@ -247,7 +246,7 @@ def test_a_problem_is_laid_out_with_a_psf_larger_than_the_image() -> None:
     rng, axis = np.random.default_rng(0), np.arange(-45, 46)
     psf = np.exp(-0.5 * np.add.outer(axis**2, axis**2) / 1.5**2)
     observation = Observation(rng.normal(size=(31, 31)), np.ones((31, 31)), psf / psf.sum(), 0.1, 25.0)
-    fit = ParametricFit(LENS, SersicProfile(1.0, 0.2, 1.0, 1.0, 0.0), None, (), 0.0, ("theta_E",), np.eye(1), 0.0, 1, 1)
+    fit = bare_fit(LENS, SersicProfile(1.0, 0.2, 1.0, 1.0, 0.0), observation.shape)
     problem = prepare_problem(
         observation, fit, Analysis(psf_radius=80, source_pixels=(8, 8), noise_treatment="diagonal")
     )

@@ -7,7 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import STAGES, Analysis, Host, Realization, RunResult, SpecError, generator, load_system, measure, run
+from engine import (
+    STAGES,
+    Analysis,
+    Host,
+    Realization,
+    RunResult,
+    SpecError,
+    generator,
+    load_system,
+    measure,
+    realization_from_dict,
+    run,
+)
 from engine.figures import run_figure
 from engine.result import ESTIMATORS, INDEX_PRIORS
 from engine.simulation import Simulation
@@ -33,7 +45,7 @@ def test_a_run_reports_everything_finite(result: RunResult) -> None:
     assert [stage.stage for stage in result.stages] == list(STAGES)
     assert result.aperture is not None
     assert math.isfinite(result.aperture.magnitude.mean)
-    assert (result.regularisation, result.noise_treatment, result.profile) == ("curvature", "diagonal", None)
+    assert (result.regularisation, result.noise_treatment, result.profile) == ("curvature", "covariance", "standard")
     for number in (result.ln_evidence, result.chi2, result.condition_number, result.arc_magnitude):
         assert math.isfinite(number)
     assert result.chain.evaluations > 100
@@ -145,8 +157,24 @@ def test_the_figure_shows_six_panels(result: RunResult) -> None:
         run_figure(replace(result, products=None))
 
 
-def test_the_defaults_are_those_of_the_paper_where_it_states_them() -> None:
-    analysis = Analysis()
+def test_the_profile_paper_is_the_paper_where_it_states_its_settings() -> None:
+    analysis = Analysis(profile="paper")
     assert analysis.source_pixels == (30, 30)
     assert analysis.regularisation == "curvature"
     assert analysis.draws == 30
+    assert not analysis.source_envelope
+    assert analysis.source_softening is None
+    assert analysis.noise_treatment == "diagonal"
+
+
+def test_what_is_given_beside_a_profile_counts() -> None:
+    assert Analysis(profile="reference", walkers=20).walkers == 20
+    assert Analysis(profile="reference").chain_length > Analysis().chain_length > Analysis(profile="draft").chain_length
+    spec = {"profile": "draft", "max_steps": 77}
+    read = realization_from_dict({**_HE0435, "analysis": spec}).analysis
+    assert (read.profile, read.max_steps, read.walkers) == ("draft", 77, Analysis(profile="draft").walkers)
+    with pytest.raises(SpecError, match="profile"):
+        realization_from_dict({**_HE0435, "analysis": {"profile": "quick"}})
+
+
+_HE0435 = {"system": "HE0435", "l_eta": 1.0, "host": {"n": 2.0, "r_eff": 0.39, "magnitude": 20.5}}

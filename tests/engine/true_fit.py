@@ -1,20 +1,24 @@
 """The truth of a scene in the form of a parametric fit, for tests of what comes after the fit."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from engine.lensing.power_law import PowerLawLens
+from engine.light.sersic import SersicProfile
 from engine.modelling.parametric import ParametricFit
 from engine.modelling.point_sources import Detection
 from engine.scene import Scene
 
 
-def true_fit(scene: Scene) -> ParametricFit:
-    shape = (scene.system.exposures.field_pixels,) * 2
+def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) -> ParametricFit:
+    """A fit that found a lens and a host, and nothing else."""
     names = ("theta_E", "q", "phi", "slope", "x", "y")
     return ParametricFit(
-        lens=scene.lens,
-        host=scene.host,
-        deflector=scene.deflector,
-        agn=tuple(Detection(source.x, source.y, source.flux, 1e3) for source in scene.agn),
+        lens=lens,
+        host=host,
+        deflector=None,
+        agn=(),
         background=0.0,
         lens_names=names,
         lens_covariance=1e-6 * np.eye(len(names)),
@@ -26,4 +30,13 @@ def true_fit(scene: Scene) -> ParametricFit:
         chi2=0.0,
         degrees_of_freedom=1,
         evaluations=0,
+    )
+
+
+def true_fit(scene: Scene) -> ParametricFit:
+    """The truth of a scene."""
+    return replace(
+        bare_fit(scene.lens, scene.host, (scene.system.exposures.field_pixels,) * 2),
+        deflector=scene.deflector,
+        agn=tuple(Detection(source.x, source.y, source.flux, 1e3) for source in scene.agn),
     )

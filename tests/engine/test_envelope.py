@@ -1,0 +1,136 @@
+"""The source as an envelope times a smooth function: exact, true to noise-free data, and its evidence at the truth."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine.imaging.drizzling import drizzle
+from engine.imaging.extended import lensed_sersic_image
+from engine.inversion.evidence import invert, ln_evidence
+from engine.inversion.mapping import Envelope, map_rays
+from engine.inversion.problem import prepare_problem
+from engine.inversion.regularisation import SourceModel
+from engine.inversion.strength import find_strength
+from engine.lensing.power_law import kernel_arguments, source_position
+from engine.light.sersic import SersicProfile, surface_brightness
+from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
+from engine.posterior.target import Target, flat_prior
+from engine.simulation import Simulation, simulate_realization
+from engine.spec import Analysis, Host, Realization
+from tests.engine.dense_oracle import LENS, Case
+
+MODEL = SourceModel(Analysis().source_pixels)
+
+
+class Modulated(Case):
+    """A case of the oracle whose rays carry an envelope."""
+
+    def __init__(self) -> None:
+        super().__init__(amplitudes=2)
+        profile = SersicProfile(1.0, 0.2, 2.0, 0.7, 0.6, 0.01, -0.02)
+        self.rays = replace(self.rays, envelope=Envelope(profile, 0.05, 0.8, LENS, (0.03, 0.0)))
+
+
+def test_evidence_and_source_are_those_of_explicit_matrices() -> None:
+    case, model = Modulated(), SourceModel((9, 11))
+    exact, solution, covariance = case.oracle(LENS, 1.0, model)
+    inversion = invert(case.operator(), LENS, 1.0, model)
+    assert ln_evidence(case.operator(), LENS, 1.0, model) == pytest.approx(exact, rel=1e-8)
+    placed = map_rays(case.rays, kernel_arguments(LENS), model.shape).envelope
+    assert placed is not None
+    brightness = placed.on_cells(inversion.grid)
+    assert np.allclose(inversion.source.ravel(), solution[:99] * brightness, rtol=1e-8, atol=1e-8 * abs(solution).max())
+    expected = covariance[:99, :99] * np.outer(brightness, brightness)
+    assert np.allclose(inversion.source_covariance(), expected, rtol=1e-6, atol=1e-8 * expected.max())
+
+
+def test_the_curvature_is_that_of_the_brightness() -> None:
+    case = Modulated()
+    operator, inversion = case.operator(), invert(case.operator(), LENS, 1.0, SourceModel((9, 11)))
+    image = inversion.mapping.apply(inversion.source.ravel())[:, None]
+    chi2 = float(image[:, 0] @ operator.couple(image)[:, 0])
+    source = inversion.source.ravel()
+    assert source @ inversion.curvature @ source == pytest.approx(chi2, rel=1e-9)
+
+
+def test_a_constant_ratio_is_the_envelope_itself_also_beyond_the_grid() -> None:
+    case = Modulated()
+    mapping = map_rays(case.rays, kernel_arguments(LENS), (5, 5))
+    placed = mapping.envelope
+    assert placed is not None
+    fluxes = mapping.apply(np.ones(25))
+    bare = replace(case.rays, envelope=None)
+    grid = map_rays(bare, kernel_arguments(LENS), (5, 5)).grid
+    assert np.array_equal(grid.x, mapping.grid.x)
+    # The packed profile of the envelope, one at r_eff, and its floor, summed over the rays of each pixel.
+    k = placed.light[1]
+    host = SersicProfile(
+        1.0,
+        1.0 / math.sqrt(placed.light[3]),
+        0.5 / placed.light[2],
+        placed.light[4],
+        0.6,
+        placed.light[7],
+        placed.light[8],
+    )
+    x, y = source_position(LENS, case.rays.x, case.rays.y)
+    shape = surface_brightness(host, x, y) / placed.light[0] * math.exp(k) + placed.floor
+    per_pixel = case.rays.subrays**2
+    expected = shape.reshape(-1, per_pixel).mean(axis=1) * case.rays.pixel_area
+    # The radial table is good to 2e-7 of the centre.
+    assert np.allclose(fluxes, expected, rtol=1e-5)
+
+
+@pytest.fixture(scope="module", params=[2.0, 4.0])
+def seen(request: pytest.FixtureRequest) -> tuple[Simulation, ParametricFit]:
+    host = Host(n=request.param, r_eff=0.39, magnitude=20.5)
+    simulation = simulate_realization(Realization(system="HE0435", l_eta=1.0, host=host, seed=5))
+    return simulation, fit_parametric(simulation.observation, agn_images=4)
+
+
+def test_the_defect_makes_the_image_of_the_fitted_host_exact(seen: tuple[Simulation, ParametricFit]) -> None:
+    simulation, fit = seen
+    problem = prepare_problem(simulation.observation, fit, Analysis())
+    rays = problem.operator.rays
+    assert rays.envelope is not None
+    fluxes = np.append(rays.of_envelope(), 1.0)
+    exact = lensed_sersic_image(simulation.observation, rays.envelope.host, fit.lens)[problem.mask]
+    assert np.abs(problem.operator.blurring @ fluxes - exact).max() < 1e-9 * exact.max()
+
+
+def test_noise_free_data_are_left_well_below_the_noise(seen: tuple[Simulation, ParametricFit]) -> None:
+    simulation, noisy_fit = seen
+    observation, exposures, lens = simulation.observation, simulation.exposures, simulation.scene.lens
+    clean = replace(observation, image=drizzle(exposures.noiseless, exposures.geometry))
+    strength = find_strength(prepare_problem(observation, noisy_fit, Analysis()).operator, lens, MODEL).ln_lambda
+    problem = prepare_problem(clean, fit_parametric(clean, agn_images=4), Analysis())
+    inversion = invert(problem.operator, lens, strength, MODEL)
+    arc = problem.operator.blurring @ inversion.mapping.apply(inversion.source.ravel())
+    amplitudes = problem.operator.fit_amplitudes(arc)
+    model = arc + problem.amplitude_images[:, problem.mask].T @ amplitudes
+    chosen = ~problem.core[problem.mask]
+    residual = ((clean.image[problem.mask] - model) / observation.noise[problem.mask])[chosen]
+    assert np.sqrt(np.mean(residual**2)) <= 0.15
+    assert np.abs(residual).max() <= 1.0
+
+
+def test_the_evidence_peaks_at_the_true_lens_within_its_own_width(seen: tuple[Simulation, ParametricFit]) -> None:
+    simulation, fit = seen
+    operator = prepare_problem(simulation.observation, fit, Analysis()).operator
+    target = Target(operator, flat_prior(fit.lens, -10.0, shear=False), MODEL)
+    start = target.vector(fit.lens, optimal_strength(target, fit.lens))
+    found = find_optimum(target, start, start_covariance(fit.lens_covariance))
+    away = (found.mean - target.vector(simulation.scene.lens, 0.0))[:-1]
+    away[2] = math.remainder(away[2], math.pi)
+    # Chi^2 of six parameters: 22.5 is exceeded once in a thousand.
+    assert away @ np.linalg.solve(found.covariance[:-1, :-1], away) < 22.5
+
+
+def test_without_an_envelope_nothing_is_added(seen: tuple[Simulation, ParametricFit]) -> None:
+    simulation, fit = seen
+    plain = prepare_problem(simulation.observation, fit, Analysis(profile="paper")).operator
+    assert plain.rays.envelope is None
+    assert plain.blurring.shape[1] == plain.rays.pixels
