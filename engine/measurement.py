@@ -26,7 +26,9 @@ from engine.spec import PROFILES, Analysis
 
 MeasurementStatus = Literal["ok", "not_converged", "poor_fit"]
 RECOMMENDED = ("image", "parametric")
-"""Estimators by preference: the answer is that of the first which there is."""
+"""Estimators by preference where the exposures are known: the answer is that of the first which there is."""
+RECOMMENDED_BY_STAMP = ("parametric",)
+"""And where stars are moved stamps: the fit of the whole image allows for their error as far as pixels share it."""
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on the status says that the model does not describe the image."""
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
@@ -302,13 +304,14 @@ def measure_image(
         warnings += found.warnings
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     by_name = {estimate.estimator: estimate for estimate in estimates}
+    preferred = RECOMMENDED if observation.response is not None else RECOMMENDED_BY_STAMP
+    host = next(by_name[name] for name in preferred if name in by_name)
     status: MeasurementStatus = "ok"
     if chi2 > POOR_FIT:
         status = "poor_fit"
         warnings.append(f"model: chi2 per degree of freedom is {chi2:.2f}; the errors do not cover what it misses")
-    elif found is not None and found.chain.summary.status != "converged":
+    elif found is not None and host.estimator == "image" and found.chain.summary.status != "converged":
         status = "not_converged"
-    host = next(by_name[name] for name in RECOMMENDED if name in by_name)
     by_inversion = None if found is None else _lens_of_chain(found.lens)
     return ImageMeasurement(
         host=host,
