@@ -9,5 +9,13 @@ from engine.spec import Realization
 
 def generator(realization: Realization, purpose: int) -> np.random.Generator:
     """The random generator of a realization for one purpose: equal specs give equal streams."""
-    key = int(realization.digest[:16], 16)
-    return np.random.default_rng(np.random.SeedSequence([realization.seed, key, purpose]))
+    return _generator(realization.digest, realization.seed, purpose)
+
+
+def sky_generator(realization: Realization, purpose: int) -> np.random.Generator:
+    """The same for what is observed: however a realization is analysed, its image has the same noise."""
+    return _generator(realization.observation_digest, realization.seed, purpose)
+
+
+def _generator(digest: str, seed: int, purpose: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([seed, int(digest[:16], 16), purpose]))

@@ -28,7 +28,7 @@ from engine.imaging.response import PointResponse
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
 from engine.scene import Scene, build_scene, resolve_dither
-from engine.seeds import generator
+from engine.seeds import sky_generator
 from engine.spec import NOMINAL_OPTICS, Camera, NoiseLevel, Optics, Realization
 
 _PSF_REACH = 5.0
@@ -207,7 +207,10 @@ def simulate_realization(realization: Realization) -> Simulation:
     # One thread: sums in a fixed order give the same bits everywhere.
     with threadpool_limits(1):
         return simulate(
-            scene, realization.noise_level, generator(realization, _SIMULATION), realization_record(scene, realization)
+            scene,
+            realization.noise_level,
+            sky_generator(realization, _SIMULATION),
+            realization_record(scene, realization),
         )
 
 

@@ -278,12 +278,13 @@ NOMINAL_OPTICS = Optics()
 PROFILES: dict[str, dict[str, Any]] = {
     "draft": {"walkers": 4, "chain_length": 30.0, "max_steps": 300},
     "standard": {},
-    "reference": {"walkers": 32, "chain_length": 100.0, "max_steps": 5000},
+    "reference": {"walkers": 32, "chain_length": 150.0, "max_steps": 5000},
     "paper": {
         "source_pixels": (30, 30),
         "source_envelope": False,
         "noise_treatment": "diagonal",
         "walkers": 14,
+        "chain_length": 50.0,
         "max_steps": 1000,
     },
 }
@@ -324,8 +325,8 @@ class Analysis:
     ray_margin: Annotated[int, Field(ge=0, le=40)] = 4
     psf_radius: Annotated[int, Field(ge=1, le=80)] = 15
     walkers: Annotated[int, Field(ge=2, le=1000)] = 8
-    chain_length: Annotated[float, Field(ge=10.0, le=1e4)] = 50.0
-    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 400
+    chain_length: Annotated[float, Field(ge=10.0, le=1e4)] = 100.0
+    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 600
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
 
     @model_validator(mode="before")
@@ -378,6 +379,13 @@ class Realization:
     def digest(self) -> str:
         """SHA-256 (hex) of the canonical JSON: the identity of the run."""
         return spec_digest(self.to_dict())
+
+    @property
+    def observation_digest(self) -> str:
+        """SHA-256 (hex) of all but the analysis: realizations that differ in it alone are the same image."""
+        document = self.to_dict()
+        del document["analysis"]
+        return spec_digest(document)
 
     @property
     def system_name(self) -> str:

@@ -22,7 +22,7 @@ from engine import (
 )
 from engine.figures import run_figure
 from engine.result import ESTIMATORS, INDEX_PRIORS
-from engine.simulation import Simulation
+from engine.simulation import Simulation, simulate_realization
 
 
 @pytest.fixture(scope="module")
@@ -178,3 +178,11 @@ def test_what_is_given_beside_a_profile_counts() -> None:
 
 
 _HE0435 = {"system": "HE0435", "l_eta": 1.0, "host": {"n": 2.0, "r_eff": 0.39, "magnitude": 20.5}}
+
+
+def test_the_noise_of_an_image_does_not_depend_on_how_it_is_analysed(realization: Realization) -> None:
+    here = simulate_realization(realization)
+    there = simulate_realization(replace(realization, analysis=Analysis(profile="draft")))
+    other = simulate_realization(replace(realization, seed=realization.seed + 1))
+    assert np.array_equal(here.observation.image, there.observation.image)
+    assert not np.array_equal(here.observation.image, other.observation.image)
