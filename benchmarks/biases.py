@@ -1,8 +1,8 @@
-"""Bias and spread of every estimator on the paper's grid, cut to 12 runs a system: 96 runs, as many at once as cores.
+"""Bias and spread of every estimator on the paper's grid at l_eta = 1.0: 112 runs, as many at once as asked for.
 
     python -m benchmarks.biases [--systems HE0435 ...] [--profile standard] [--processes 2] [--results FILE]
 
-n of 2 and 4, both radii, three magnitudes, l_eta = 1.0, one seed each. Each run is appended to the results file as it
+n of 2 and 4, both radii, three or four magnitudes, one seed each. Each run is appended to the results file as it
 ends, and one that is there already (by the digest of its specification and of the engine) is not repeated. The tables
 go to docs/tables/biases.md.
 """
@@ -32,7 +32,7 @@ BRIGHT_ARC = 20.0
 
 
 def paper_runs(systems: Iterable[str], profile: str) -> list[Realization]:
-    """The realizations of the cut grid."""
+    """The realizations of the grid at l_eta = 1.0."""
     analysis = Analysis(profile=profile)  # type: ignore[arg-type]  # refused by name where it is none
     grid = Grid(preset="h0licow-vi", systems=tuple(systems), n=(2.0, 4.0), l_eta=(1.0,), analysis=analysis)
     return [one.realization for one in expand(grid)]
@@ -128,7 +128,7 @@ def table(records: list[dict[str, Any]], profile: str) -> str:
         f"{len(good)} of {len(records)} runs have a result; "
         f"{sum(r['status'] != 'converged' for r in good)} chains are shorter than 50 autocorrelation times. CPU time "
         f"of a run: median {np.median([r['cpu_seconds'] for r in good]):.0f} s, "
-        f"longest {max(r['cpu_seconds'] for r in good):.0f} s. Engine `{engine_digest()[:12]}`.",
+        f"longest {max(r['cpu_seconds'] for r in good):.0f} s. Engine `{records[0]['engine'][:12]}`.",
         "",
         "## Summary",
         "",

@@ -148,7 +148,7 @@ def table(records: list[dict[str, Any]], profile: str) -> str:
         "Written by `python -m benchmarks.coverage`: systems like HE0435 with lens, source position and host",
         f"drawn from a prior (host 19.5-22 mag, R_eff 0.2-0.6 arcsec, n 1-5), profile `{profile}`, n free in 0.3-8.",
         f"{len(good)} of {len(records)} have a result; {sum(r['status'] != 'converged' for r in good)} chains did not "
-        f"converge and are counted all the same. Engine `{engine_digest()[:12]}`.",
+        f"converge and are counted all the same. Engine `{records[0]['engine'][:12]}`.",
         "",
         "Share of truths in the 68 and 95 % intervals; p of a flat histogram of ranks; mean and deviation of the pulls",
         "(truth minus mean in stated deviations); the histogram of ranks, from truths below all draws to above all.",

@@ -11,17 +11,17 @@ from service.schemas import GridView, RunView, Summary, SummaryEstimate, Summary
 
 _INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
 ROWS: tuple[tuple[EstimateName, str, str], ...] = (
-    ("paper_free", "magnitude", "magnitude, n free"),
-    ("paper_fixed", "magnitude", "magnitude, n fixed"),
-    ("paper_free", "r_eff", "R_eff"),
-    ("paper_free", "n", "n"),
-    ("covariance_free", "magnitude", "magnitude (covariance)"),
-    ("projected_free", "magnitude", "magnitude (projected)"),
-    ("image_wide", "magnitude", "magnitude (image)"),
-    ("image_wide", "r_eff", "R_eff (image)"),
-    ("image_wide", "n", "n (image)"),
+    ("image_wide", "magnitude", "magnitude"),
+    ("image_wide", "r_eff", "R_eff"),
+    ("image_wide", "n", "n"),
+    ("projected_wide", "magnitude", "magnitude (projected)"),
+    ("covariance_wide", "magnitude", "magnitude (covariance)"),
+    ("paper_free", "magnitude", "magnitude (paper)"),
+    ("paper_fixed", "magnitude", "  n fixed"),
+    ("paper_free", "r_eff", "R_eff (paper)"),
+    ("paper_free", "n", "n (paper)"),
 )
-"""What is shown of each input: by ``paper`` with n in 1-4 where nothing is said, by ``image`` with n in 0.3-8."""
+"""What is shown of each input: by ``image`` with n in 0.3-8 where nothing is said, by ``paper`` with n in 1-4."""
 
 
 def value_of(estimate: SummaryEstimate, quantity: str) -> SummaryValue:
@@ -52,9 +52,7 @@ def summary_table(summary: Summary) -> Table:
             value = value_of(found, quantity)
             true, bias = _number(value.input, "{:g}"), _number(value.bias, "{:+.3f}")
             table.add_row(cell, title, true, f"{value.mean:.3f} ± {value.sd:.3f}", bias, end_section=last)
-    table.caption = (
-        "bias: recovered minus true; sd: spread of the draws of a run; n in 0.3-8 for image, else in 1-4 or fixed"
-    )
+    table.caption = "bias: recovered minus true; sd: spread of the draws of a run; estimator image where none is named; n in 1-4 for paper"
     return table
 
 

@@ -78,11 +78,11 @@ def run_figure(result: RunResult) -> Figure:
         panel.set_ylabel("arcsec (North)", fontsize=7)
     host = "no estimate"
     for found in result.estimates:
-        if (found.estimator, found.index_prior) == ("paper", "free"):
+        if (found.estimator, found.index_prior) == ("image", "wide"):
             host = f"{found.magnitude.mean:.2f} +- {found.magnitude.sd:.2f} mag"
     figure.suptitle(
         f"run {result.realization_digest[:12]}   chi$^2$/dof {result.chi2 / result.degrees_of_freedom:.2f}   "
-        f"host {host} (paper estimator)   "
+        f"host {host} (image estimator)   "
         f"chain {result.chain.status.replace('_', ' ')}",
         fontsize=10,
     )
