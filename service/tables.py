@@ -52,8 +52,10 @@ def summary_table(summary: Summary) -> Table:
             value = value_of(found, quantity)
             true, bias = _number(value.input, "{:g}"), _number(value.bias, "{:+.3f}")
             table.add_row(cell, title, true, f"{value.mean:.3f} ± {value.sd:.3f}", bias, end_section=last)
-    table.caption = "bias: recovered minus true; sd: spread of the draws of a run; by the image estimator where none is named; "
+    table.caption = (
+        "bias: recovered minus true; sd: spread of the draws of a run; by the image estimator where none is named; "
         "n in 1-4 for paper"
+    )
     return table
 
 
