@@ -19,6 +19,7 @@ from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.foreign import NoiseFromImage, observation_from_arrays
 from engine.imaging.foreign_files import read_foreign_observation
 from engine.imaging.observation import Observation
+from engine.inspection import InversionView, inspect_inversion, inspect_simulation
 from engine.measurement import HostEstimate, ImageMeasurement, Measured, measure_image
 from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, measure, run
@@ -59,6 +60,7 @@ __all__ = [
     "HostEstimate",
     "ImageMeasurement",
     "InversionError",
+    "InversionView",
     "LensEquationError",
     "LensParameter",
     "LensSystem",
@@ -87,6 +89,8 @@ __all__ = [
     "expand",
     "field_steps",
     "generator",
+    "inspect_inversion",
+    "inspect_simulation",
     "load_camera",
     "load_system",
     "measure",

@@ -112,10 +112,15 @@ def _on_grid(host: SersicProfile, grid: SourceGrid) -> FloatArray:
     return profile_on_grid(host, grid.x_edges, grid.y_edges).reshape(grid.shape)
 
 
-def _products(
-    observation: Observation, problem: Problem, best: Inversion, target: Target, chain: Chain, truth: Truth | None
+def products_of(
+    observation: Observation,
+    problem: Problem,
+    best: Inversion,
+    samples: FloatArray,
+    names: tuple[str, ...],
+    truth: Truth | None,
 ) -> tuple[Products, float]:
-    """Maps for figures and files at the best state of the chain, and its chi^2."""
+    """Maps for figures and files of an inversion with the samples (n, d) it is one of, and its chi^2."""
     operator, mask = problem.operator, problem.mask
     arc = operator.blurring @ best.mapping.apply(best.source.ravel())
     amplitudes = operator.fit_amplitudes(arc)
@@ -138,8 +143,8 @@ def _products(
         source_truth=None if truth is None else _on_grid(truth.host, best.grid),
         source_x_edges=best.grid.x_edges,
         source_y_edges=best.grid.y_edges,
-        chain=chain.flat(),
-        parameter_names=target.prior.names,
+        chain=samples,
+        parameter_names=names,
     )
     return products, operator.chi2(arc, amplitudes)
 
@@ -165,6 +170,17 @@ def _refit(
     if aperture is None:
         warnings.append("aperture: no drawn source has light within it")
     return refits, tuple(summary for summary in summaries if summary is not None), aperture, warnings
+
+
+def prepare_target(problem: Problem, fit: ParametricFit, analysis: Analysis, *, shear: bool) -> Target:
+    """The posterior of lens and strength round a parametric fit."""
+    source = SourceModel(
+        analysis.source_pixels,
+        analysis.regularisation,
+        analysis.source_softening,
+        analysis.regularisation_length,
+    )
+    return Target(problem.operator, flat_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear), source)
 
 
 def measure(
@@ -210,14 +226,7 @@ def measure(
     with watch.stage("prepare"):
         problem = prepare_problem(observation, fit, analysis)
     with watch.stage("optimum"):
-        prior = flat_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear)
-        source = SourceModel(
-            analysis.source_pixels,
-            analysis.regularisation,
-            analysis.source_softening,
-            analysis.regularisation_length,
-        )
-        target = Target(problem.operator, prior, source)
+        target = prepare_target(problem, fit, analysis, shear=shear)
         start = target.vector(fit.lens, optimal_strength(target, fit.lens))
         laplace = find_optimum(target, start, start_covariance(fit.lens_covariance))
     with watch.stage("chain"):
@@ -236,7 +245,7 @@ def measure(
         draws = [source_draw(target.invert(state), target.lens(state), rng) for state in states]
         flat_ln = chain.ln_posterior.ravel()
         best = target.invert(chain.flat()[int(np.argmax(flat_ln))])
-        products, chi2 = _products(observation, problem, best, target, chain, truth)
+        products, chi2 = products_of(observation, problem, best, chain.flat(), target.prior.names, truth)
     with watch.stage("refit"):
         drawn = DrawSet(problem.operator, tuple(draws))
         refits, estimates, aperture, warnings = _refit(drawn, observation.zero_point, truth, fixed_index, rng)

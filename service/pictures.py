@@ -1,4 +1,4 @@
-"""The commands that simulate without a service: one realization, a system's 48, the eight systems."""
+"""The commands that simulate without a service: one realization, a system's 48, the eight systems, an inversion."""
 
 from __future__ import annotations
 
@@ -118,7 +118,41 @@ def gallery(
         _save(gallery_figure(simulations), out / "gallery.png")
 
 
-COMMANDS = (simulate, montage, gallery)
+def inversion(
+    system: Annotated[str, typer.Argument(help="A system of the catalogue, as HE0435, or a TOML or JSON file")],
+    n: Annotated[float, typer.Option(help="Sersic index of the host")] = _N,
+    r_eff: Annotated[float | None, typer.Option(help="arcsec; the paper's smaller one where not given")] = None,
+    magnitude: Annotated[float | None, typer.Option(help="AB; the paper's second brightest where not given")] = None,
+    l_eta: Annotated[float, typer.Option(help="Slope of the lens, gamma' - 1")] = _L_ETA,
+    profile: Annotated[str, typer.Option(help="draft, standard, reference or paper")] = "standard",
+    source_pixels: Annotated[int | None, typer.Option(help="Source pixels along a side; the profile's without")] = None,
+    seed: SeedOption = 0,
+    noise_level: NoiseOption = "author",
+    mass_model: MassOption = "recommended",
+    camera: CameraOption = None,
+    out: Annotated[Path | None, typer.Option(help="The picture; SYSTEM_inversion.png without")] = None,
+) -> None:
+    """Picture one inversion: data, model, residual, source and its resolution, ln Z along each lens parameter."""
+    grid = {} if source_pixels is None else {"source_pixels": (source_pixels, source_pixels)}
+    common = {
+        "seed": seed, "noise_level": noise_level, "mass_model": mass_model, "analysis": {"profile": profile, **grid},
+    }  # fmt: skip
+    with refusals():
+        from engine import inspect_simulation, simulate_realization  # noqa: PLC0415
+        from engine.figures import inversion_figure  # noqa: PLC0415
+
+        realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
+        with _progress(f"inverting {realization.system_name}", 3) as advance:
+            simulation = simulate_realization(realization)
+            advance()
+            view = inspect_simulation(simulation, realization.analysis)
+            advance()
+            figure = inversion_figure(view)
+            advance()
+        _save(figure, out or Path(f"{realization.system_name}_inversion.png"))
+
+
+COMMANDS = (simulate, montage, gallery, inversion)
 
 
 def _realization(system: str, host: HostOptions, camera: str | None, common: dict[str, Any]) -> Realization:
