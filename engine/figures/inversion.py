@@ -165,7 +165,7 @@ def inversion_figure(view: InversionView) -> Figure:
     for row in range(_TRACE_ROWS):
         panels[row, 0].set_ylabel(r"$\Delta\ln Z$", fontsize=8)
     found = view.inversion
-    figure.suptitle(
+    maps.suptitle(
         f"ln Z {found.ln_evidence:.1f}, chi$^2$/dof {view.chi2 / view.degrees_of_freedom:.2f}, "
         f"{view.effective_parameters:.0f} of {found.source.size} source pixels decided by the data, "
         f"condition number {found.condition_number:.0e}",

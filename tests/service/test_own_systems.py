@@ -121,6 +121,14 @@ def test_simulate_takes_the_papers_host_where_none_is_given(tmp_path: Path) -> N
     assert record["CAMERA"] == "my-camera"
 
 
+def test_inversion_pictures_one_inversion(tmp_path: Path) -> None:
+    picture = tmp_path / "new" / "one.png"
+    done = command("inversion", str(EXAMPLES / "my_system.toml"), *QUICK, "--source-pixels", "8", "--out", str(picture))
+    assert done.exit_code == 0, done.output
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert str(picture.name) in done.output
+
+
 def camera_file(folder: Path) -> Path:
     path = folder / "camera.json"
     path.write_text(json.dumps(OWN["camera"]), encoding="utf-8")
@@ -131,6 +139,7 @@ def camera_file(folder: Path) -> Path:
     ("arguments", "told"),
     [
         (["simulate", "nowhere"], "system: got 'nowhere'"),
+        (["inversion", "HE0435", "--profile", "quick"], "analysis.profile: got 'quick'"),
         (["simulate", "absent.toml"], "absent.toml"),
         (["simulate", str(EXAMPLES / "my_system.toml")], "give --r-eff and --magnitude"),
         (["simulate", str(EXAMPLES / "my_system.toml"), *QUICK, "--l-eta", "1.2"], "l_eta: got 1.2"),
