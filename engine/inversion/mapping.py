@@ -184,10 +184,10 @@ class Mapping:
 
     def of_brightness(self, envelope: FloatArray) -> Mapping:
         """The same for sources given by their brightness at the nodes, of a mapping for their ratio to an envelope."""
-        return replace(self, weights=self.weights / envelope[self._known_columns()], envelope=None)
-
-    def _known_columns(self) -> NDArray[np.int32]:
-        return np.where(np.arange(self.columns.shape[1]) < self.entries[:, None], self.columns, 0)
+        known = np.arange(self.columns.shape[1]) < self.entries[:, None]
+        weights = np.zeros_like(self.weights)
+        weights[known] = self.weights[known] / envelope[self.columns[known]]
+        return replace(self, weights=weights, envelope=None)
 
     def apply(self, source: FloatArray) -> FloatArray:
         """Image-plane fluxes (pixels,) before the PSF, of a source (ny nx,)."""
