@@ -1,8 +1,8 @@
 """One evidence evaluation by PyAutoLens, run in its own environment: a scene as a file in, times and matrices out.
 
 Stands alone: nothing of hostlens is installed where it runs. Its fastest path on a CPU: a uniform rectangular mesh,
-constant regularisation, NumPy with the Numba sparse operator, without positivity. After one line about itself it times
-one evaluation for every line on its standard input, so that the caller can alternate.
+constant regularisation, NumPy with the Numba sparse operator, without positivity. After one line about itself it
+takes the CPU time of one evaluation for every line on its standard input, so that the caller can alternate.
 """
 
 import json
@@ -61,9 +61,9 @@ def main() -> None:
     )
     print(json.dumps({"version": al.__version__, "operator": type(dataset.sparse_operator).__name__}), flush=True)
     for _ in sys.stdin:
-        began = time.perf_counter()
+        began = time.process_time()
         _ = fit().log_evidence
-        print(time.perf_counter() - began, flush=True)
+        print(time.process_time() - began, flush=True)
 
 
 if __name__ == "__main__":
