@@ -13,6 +13,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -198,28 +199,34 @@ def main() -> None:
     parser.add_argument("--systems", nargs="+", default=list(system_names()), choices=system_names())
     systems = parser.parse_args().systems
     began, found, text, refused = time.process_time(), [], [], []
-    with threadpool_limits(1):
-        for system in systems:
-            for n in INDICES:
-                try:
-                    heading, points = of_system(system, n)
-                except EngineError as error:
-                    refused.append(f"{system}, n = {n:g}: {error}")
-                    print(refused[-1], flush=True)
-                    continue
-                lines = rows(points)
-                print(f"\n{heading} ({time.process_time() - began:.0f} s)", *lines, sep="\n", flush=True)
-                found.append(points)
-                text += [f"### {heading}", "", *lines, ""]
-    if not found:
-        raise SystemExit("no observation was measured")
-    overall = summary(found)
-    print("", *overall, sep="\n")
-    if set(systems) != set(system_names()):
-        return
-    missing = [f"Not measured: {each}" for each in refused] + [""] if refused else []
-    body = [HEADING, f"## All {len(found)} observations", "", *overall, "", *missing, "## Each", "", *text]
-    TABLE.write_text("\n".join(body).rstrip() + "\n", encoding="utf-8")
+    for system, n in product(systems, INDICES):
+        try:
+            with threadpool_limits(1):
+                heading, points = of_system(system, n)
+        except EngineError as error:
+            refused.append(f"Not measured: {system}, n = {n:g}: {error}")
+            print(refused[-1], flush=True)
+        else:
+            lines = rows(points)
+            print(f"\n{heading} ({time.process_time() - began:.0f} s)", *lines, sep="\n", flush=True)
+            found.append(points)
+            text += [f"### {heading}", "", *lines, ""]
+        if found and set(systems) == set(system_names()):
+            # After each, so that a run cut short leaves what it has found.
+            body = [
+                HEADING,
+                f"## All {len(found)} observations",
+                "",
+                *summary(found),
+                "",
+                *refused,
+                "## Each",
+                "",
+                *text,
+            ]
+            TABLE.write_text("\n".join(body).rstrip() + "\n", encoding="utf-8")
+    if found:
+        print("", *summary(found), sep="\n")
 
 
 if __name__ == "__main__":
