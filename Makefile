@@ -14,7 +14,7 @@ help:
 	@echo "make test    ruff, mypy and all tests"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   benchmarks: the answer asserted, then the time as a ratio to a peer"
-	@echo "make tables  the tables in docs/tables: error, time and memory of each step of the simulation"
+	@echo "make tables  the tables in docs/tables: error, time and memory of the simulation and of the evidence"
 	@echo "make clean   remove the virtual environment and caches (not var/, where data lies)"
 
 $(BIN)/python:
@@ -59,11 +59,12 @@ bench: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.deflection
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.rendering
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence
-	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence_growth
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.strength
 
 tables: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation --write docs/tables/simulation.md
+	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence_growth
+	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.source_grid
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
