@@ -321,7 +321,7 @@ def test_an_estimator_without_an_answer_is_missing_with_a_warning_and_the_others
     lit = draw_of(on_grid(TRUTH) * 1e3)
     draws = [replace(lit, mean=-lit.mean, drawn=-lit.drawn)] * 3
     drawn = DrawSet(operator, tuple(draws))
-    estimates, aperture, warnings = _refit(drawn, 25.0, Truth(LENS, TRUTH), 2.0, np.random.default_rng(0))
+    _, estimates, aperture, warnings = _refit(drawn, 25.0, Truth(LENS, TRUTH), 2.0, np.random.default_rng(0))
     names = {estimate.estimator for estimate in estimates}
     assert "projected" in names
     assert not {"paper", "covariance"} & names
@@ -341,7 +341,7 @@ def test_a_host_fainter_than_the_noise_gives_finite_numbers_and_counts_what_fail
     rng = np.random.default_rng(6)
     draws = [source_draw(invert(operator, LENS, 2.0, SourceModel((10, 10))), LENS, rng) for _ in range(8)]
     drawn = DrawSet(operator, tuple(draws))
-    estimates, aperture, warnings = _refit(drawn, 25.0, Truth(LENS, HOST), 1.5, np.random.default_rng(0))
+    _, estimates, aperture, warnings = _refit(drawn, 25.0, Truth(LENS, HOST), 1.5, np.random.default_rng(0))
     assert len(estimates) + len([warning for warning in warnings if "estimator" in warning]) == 12
     assert any(0 < estimate.failed < 8 for estimate in estimates)
     for estimate in estimates:
