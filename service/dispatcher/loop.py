@@ -32,7 +32,7 @@ from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored
 
 _LOG = logging.getLogger(__name__)
-_GATHER_S = 30.0
+_FETCH_S, _GATHER_S = 1.0, 30.0
 _LOOK_S = 1.0
 _MAX_BACK_OFF_S = 10.0
 _EMPTY_LOOKS = 3
@@ -54,6 +54,10 @@ class Flight:
     started: float
     missed: float | None = None
     """Since when its worker has been gone."""
+    answered: bool = False
+    """Whether it has come to its end on its worker, which may be at the next run while the answer is fetched."""
+    patience_s: float = _FETCH_S
+    """How long the next look waits for the answer."""
 
 
 class Dispatcher:
@@ -193,6 +197,7 @@ class Dispatcher:
         """Give workers that have just ended these tasks the next, before their answers are fetched and stored."""
         for flight in self._flights.values():
             if flight.future.key in tasks and flight.future.status == "finished":
+                flight.answered = True
                 self._slots.release(flight.worker, flight.future.key)
         workers = self._pool.workers() if len(self._ahead) else []
         old = self._slots.outlived(workers, time.monotonic())
@@ -270,7 +275,7 @@ class Dispatcher:
                 return
         else:
             try:
-                answers = future.result(timeout=_GATHER_S)
+                answers = self._fetch(flights[0])
             except (OSError, TimeoutError, CancelledError):
                 return  # the worker went before its answer was fetched: a later look finds out what is left
             except Exception as broken:  # noqa: BLE001 - the answer came from another process and may be anything
@@ -283,6 +288,18 @@ class Dispatcher:
             return
         for flight in flights:
             self._end(flight, answers if error is None else error, results)
+
+    def _fetch(self, flight: Flight) -> Any:
+        """The answers of a Dask task that has ended; TimeoutError where they do not come for now.
+
+        Dask waits on for a worker that never returns, and everything else would wait with it: hence a short wait, and
+        a longer one at each later look, for a large answer over a slow line.
+        """
+        try:
+            return flight.future.result(timeout=flight.patience_s)
+        except TimeoutError:
+            flight.patience_s = min(2.0 * flight.patience_s, _GATHER_S)
+            raise
 
     def _end(self, flight: Flight, answers: Any, results: list[tuple[Lease, ResultPayload]]) -> None:
         lease = flight.lease
@@ -334,8 +351,12 @@ class Dispatcher:
             self._lose(flights, "the worker was stopped")
             return
         self._metrics.worker_deaths.inc()
-        _LOG.warning("worker %s died with %d runs", address, len(flights))
-        self._deaths.add(flights, time.monotonic())
+        answered = [flight for flight in flights if flight.answered]
+        under_way = [flight for flight in flights if not flight.answered]
+        _LOG.warning("worker %s died with %d runs", address, len(under_way))
+        # What had ended did not kill it, only its answer is lost.
+        self._lose(answered, "the worker died before its answer was fetched")
+        self._deaths.add(under_way, time.monotonic())
 
     def _look_for_deaths(self) -> None:
         """Judge the dead, and give back what is on workers that are gone without Dask having blamed anyone."""

@@ -267,6 +267,34 @@ def test_runs_that_shared_a_dead_worker_are_charged_nothing_and_run_one_at_a_tim
     assert sorted(outcomes(setting)) == [["done"]] * 5 + [["suspected", "done"]] * 3
 
 
+def test_a_run_that_had_ended_on_a_worker_that_the_next_one_killed_is_not_suspected(
+    database: Database, tmp_path: Path
+) -> None:
+    class Unreachable(InstantPool):
+        """The answer of the first run never comes: its worker is at the second, which kills it."""
+
+        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+            future = super().submit(leases, worker)
+            if len(self.futures) == 1:
+                future.result = self._no_answer  # type: ignore[method-assign]
+            return future
+
+        def _no_answer(self, timeout: float) -> Any:
+            for second in self.futures[1:2]:
+                second.kill()
+            raise TimeoutError
+
+    pool = Unreachable(tmp_path, "pending", "pending")
+    pool.addresses = ["a"]
+    setting = Setting(database, pool, runs=2)
+    setting.dispatcher._brief = True
+    setting.run(until=lambda: len(pool.submitted) == 1)
+    pool.futures[0].finish(tmp_path)
+    setting.run(steps=2000)
+    assert setting.grids.grid(setting.grid_id).counts.done == 2
+    assert outcomes(setting) == [["forgotten", "done"], ["worker_lost", "done"]]
+
+
 def test_runs_of_workers_that_died_in_the_same_moment_are_charged_nothing(database: Database, tmp_path: Path) -> None:
     setting = Setting(database, InstantPool(tmp_path, "error", "error"), runs=3)
     setting.run()

@@ -18,7 +18,7 @@ from service.drills.requests import Cancel, Idempotency
 from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from service.drills.scale import Overhead, Throughput
 from service.drills.volume import Listing, Submission
-from service.drills.workers import SilentWorker
+from service.drills.workers import Lifetime, SilentWorker
 from service.store.database import Database
 from service.store.grids import GridStore
 from tests.service.plans import submit
@@ -47,6 +47,7 @@ def _is_at(process: psutil.Process, folder: Path) -> bool:
         DiskFull(runs=8, full_s=1.5),
         StoppedWorker(runs=6, deadline_s=3.0),
         SilentWorker(runs=6),
+        Lifetime(runs=40, lifetime_s=2.0),
         TwoDispatchers(runs=20),
         Poison(runs=24, batch=4),
         Cancel(runs=1000),
