@@ -12,10 +12,10 @@ from engine.inversion.evidence import Inversion
 from engine.inversion.problem import prepare_problem
 from engine.inversion.resolution import SourceResolution, source_resolution
 from engine.modelling.parametric import ParametricFit, fit_parametric
-from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
+from engine.posterior.optimum import find_optimum
 from engine.posterior.traces import EvidenceTrace, trace_evidence
 from engine.result import Products
-from engine.run import Truth, prepare_target, products_of
+from engine.run import Truth, find_start, prepare_target, products_of
 from engine.simulation import Simulation
 from engine.spec import Analysis
 
@@ -72,8 +72,7 @@ def inspect_inversion(
         fit = fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
     problem = prepare_problem(observation, fit, analysis)
     target = prepare_target(problem, fit, analysis, shear=shear)
-    start = target.vector(fit.lens, optimal_strength(target, fit.lens))
-    optimum = find_optimum(target, start, start_covariance(fit.lens_covariance))
+    optimum = find_optimum(target, *find_start(target, fit))
     inversion = target.invert(optimum.mean)
     names = target.prior.names
     true = None if truth is None else np.array([getattr(truth.lens, name) for name in names[:-1]])

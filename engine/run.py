@@ -11,13 +11,15 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from engine.catalogue import load_system
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
+from engine.errors import SpecError
 from engine.imaging.observation import Observation
 from engine.inversion.evidence import Inversion
 from engine.inversion.mapping import SourceGrid
@@ -26,9 +28,10 @@ from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, mean_surface_brightness
 from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
-from engine.posterior.target import Target, flat_prior
+from engine.posterior.target import Target, wide_prior
 from engine.refits.draws import DrawSet, source_draw
 from engine.refits.estimators import Refit, refit_draws
 from engine.refits.profiles import profile_on_grid
@@ -180,7 +183,21 @@ def prepare_target(problem: Problem, fit: ParametricFit, analysis: Analysis, *, 
         analysis.source_softening,
         analysis.regularisation_length,
     )
-    return Target(problem.operator, flat_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear), source)
+    prior = wide_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear).restricted(analysis.priors)
+    anchors = problem.operator.rays.anchors
+    agn = None
+    if analysis.agn_position_sd is not None:
+        if len(anchors) < 2:
+            raise SpecError("agn_position_sd", analysis.agn_position_sd, "nothing where there are no two AGN images")
+        agn = AgnPositions(anchors, analysis.agn_position_sd)
+    return Target(problem.operator, prior, source, agn)
+
+
+def find_start(target: Target, fit: ParametricFit) -> tuple[FloatArray, FloatArray]:
+    """Where the search for the optimum begins: the parametric fit's lens inside the prior, and a covariance (d, d)."""
+    lens = target.lens(target.prior.inside(target.vector(fit.lens, 0.0)))
+    start = target.prior.inside(target.vector(lens, optimal_strength(target, lens)))
+    return start, target.prior.no_wider(start_covariance(fit.lens_covariance))
 
 
 def measure(
@@ -227,8 +244,7 @@ def measure(
         problem = prepare_problem(observation, fit, analysis)
     with watch.stage("optimum"):
         target = prepare_target(problem, fit, analysis, shear=shear)
-        start = target.vector(fit.lens, optimal_strength(target, fit.lens))
-        laplace = find_optimum(target, start, start_covariance(fit.lens_covariance))
+        laplace = find_optimum(target, *find_start(target, fit))
     with watch.stage("chain"):
         report = watch.progress
         chain = run_chain(
@@ -272,6 +288,14 @@ def measure(
     )
 
 
+def analysis_of(realization: Realization) -> Analysis:
+    """The analysis with the priors that the system states, where it has none of its own."""
+    system = realization.system
+    stated = (load_system(system) if isinstance(system, str) else system).priors
+    analysis = realization.analysis
+    return replace(analysis, priors={**stated, **analysis.priors}) if stated else analysis
+
+
 def run(realization: Realization, progress: Progress | None = None) -> RunResult:
     """Simulate and analyse one realization.
 
@@ -296,7 +320,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
             scene = simulation.scene
         found = measure(
             simulation.observation,
-            realization.analysis,
+            analysis_of(realization),
             generator(realization, 1),
             agn_images=len(scene.agn),
             deflector=scene.deflector is not None,

@@ -46,9 +46,37 @@ Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-
 NoiseLevel = Literal["author", "handbook"]
 ProfileName = Literal["draft", "standard", "reference", "paper"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
+LensParameterName = Literal["theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda"]
 RegularisationName = Literal["zeroth", "gradient", "curvature", "matern"]
 _Read = TypeVar("_Read")
 _SLOPE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, config=_STRICT)
+class ParameterPrior:
+    """Prior of one parameter of the chain: flat from ``low`` to ``high``, times a Gaussian of ``mean`` and ``sd``.
+
+    A bound that is None stays where it is by default. Units and frame are those of the result: arcsec, radians, image
+    frame of :mod:`engine.conventions`.
+    """
+
+    low: Number | None = None
+    high: Number | None = None
+    mean: Number | None = None
+    sd: Positive | None = None
+
+    @model_validator(mode="after")
+    def _says_something(self) -> ParameterPrior:
+        if (self.mean is None) != (self.sd is None):
+            raise SpecError("mean, sd", (self.mean, self.sd), "both or neither")
+        if self.low is None and self.high is None and self.mean is None:
+            raise SpecError("low, high, mean, sd", None, "a bound, or a mean with its sd")
+        if self.low is not None and self.high is not None and not self.low < self.high:
+            raise SpecError("low, high", (self.low, self.high), "a lower bound below the upper")
+        return self
+
+
+Priors = dict[LensParameterName, ParameterPrior]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -200,7 +228,8 @@ class LensSystem:
     """A lensed AGN as observed: camera, exposures, AGN images, deflector light and mass models by name and l_eta.
 
     ``camera`` names one of the catalogue or is one; ``coordinates`` are RA and Dec [deg, ICRS] of the centre of the
-    image, None where they do not matter.
+    image, None where they do not matter. ``priors`` are those of the lens parameters, by name, where they differ from
+    the wide ones that hold otherwise.
     """
 
     name: Identifier
@@ -212,6 +241,7 @@ class LensSystem:
     mass_models: Annotated[dict[str, dict[str, MassModel]], Field(min_length=1)]
     deflector: SersicLight | None = None
     coordinates: tuple[RightAscension, Declination] | None = None
+    priors: Priors = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _names_and_slopes(self) -> LensSystem:
@@ -309,6 +339,8 @@ class Analysis:
     otherwise for a smooth source. ``walkers`` walk until the chain is ``chain_length`` autocorrelation times long, or
     for ``max_steps``.
     ``regularisation_length`` is the correlation length of ``matern`` [source pixels], without effect otherwise.
+    ``priors`` of the lens parameters, by name, come before those of the system. With ``agn_position_sd`` [arcsec per
+    axis] the measured positions of the AGN images have to come from one point of the source plane.
     """
 
     profile: ProfileName = "standard"
@@ -328,6 +360,8 @@ class Analysis:
     chain_length: Annotated[float, Field(ge=10.0, le=1e4)] = 100.0
     max_steps: Annotated[int, Field(ge=10, le=200_000)] = 600
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
+    priors: Priors = Field(default_factory=dict)
+    agn_position_sd: Annotated[float, Field(ge=1e-5, le=1.0)] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -373,6 +407,11 @@ class Realization:
             del dumped["optics"]
         if dumped["analysis"]["regularisation"] != "matern":
             del dumped["analysis"]["regularisation_length"]
+        if dumped["analysis"]["agn_position_sd"] is None:
+            del dumped["analysis"]["agn_position_sd"]
+        for holder in (dumped["analysis"], dumped["system"]):
+            if isinstance(holder, dict) and not holder["priors"]:
+                del holder["priors"]
         return dumped
 
     @property
@@ -382,9 +421,11 @@ class Realization:
 
     @property
     def observation_digest(self) -> str:
-        """SHA-256 (hex) of all but the analysis: realizations that differ in it alone are the same image."""
+        """SHA-256 (hex) of all but analysis and priors: realizations that differ in these alone are the same image."""
         document = self.to_dict()
         del document["analysis"]
+        if isinstance(document["system"], dict):
+            document["system"].pop("priors", None)
         return spec_digest(document)
 
     @property

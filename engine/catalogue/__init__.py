@@ -69,6 +69,7 @@ def load_system(name: str) -> LensSystem:
         "agn": [{"name": label, **image} for label, image in facts["agn"]["images"].items()],
         "deflector": _pick(facts["deflector"], *light),
         "coordinates": facts["coordinates"]["degrees"],
+        "priors": facts.get("priors", {}),
         "host_q": facts["host_shape"]["q"],
         "host_position_angle": facts["host_shape"]["position_angle"],
         "mass_models": {

@@ -3,37 +3,106 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from engine.conventions import FloatArray
-from engine.errors import InversionError
+from engine.errors import InversionError, SpecError
 from engine.inversion.evidence import Inversion, invert, ln_evidence
 from engine.inversion.operator import Operator
 from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
+from engine.posterior.agn_positions import AgnPositions
+from engine.spec import LensParameterName, ParameterPrior
 
 LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")
 SHEAR_NAMES = ("gamma1", "gamma2")
 STRENGTH = "ln_lambda"
 
 
+# What the lens model can be at all; priors that are asked for end here.
+_LIMITS = {
+    "theta_E": (1e-3, math.inf),
+    "q": (0.05, 1.0),
+    "slope": (1.2, 2.8),
+    "gamma1": (-0.7, 0.7),
+    "gamma2": (-0.7, 0.7),
+}
+_START_MARGIN = 0.02
+"""How far inside the prior a start is moved, in units of its width."""
+
+_STEP_SHARE = 0.1
+
+
 @dataclass(frozen=True)
 class Prior:
-    """Flat between ``low`` and ``high`` (arrays in the order of the parameters)."""
+    """Flat between bounds, times a Gaussian where ``sd`` is finite; arrays (d,) in the order of the parameters."""
 
     names: tuple[str, ...]
     low: FloatArray
     high: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+
+    @classmethod
+    def flat(cls, names: tuple[str, ...], low: FloatArray, high: FloatArray) -> Prior:
+        """Flat in every parameter."""
+        return cls(names, low, high, np.zeros_like(low), np.full_like(low, math.inf))
 
     def holds(self, values: FloatArray) -> bool:
         """Whether the values lie inside."""
         return bool(np.all(values > self.low) and np.all(values < self.high))
 
+    def ln_density(self, values: FloatArray) -> float:
+        """Ln of the prior inside its bounds, up to a constant."""
+        return float(-0.5 * (((values - self.mean) / self.sd) ** 2).sum())
 
-def flat_prior(lens: PowerLawLens, ln_lambda: float, *, shear: bool) -> Prior:
-    """The prior round a starting lens.
+    def inside(self, values: FloatArray) -> FloatArray:
+        """The values, moved inside where they are not."""
+        margin = _START_MARGIN * (self.high - self.low)
+        return np.asarray(np.clip(values, self.low + margin, self.high - margin))
+
+    def no_wider(self, covariance: FloatArray) -> FloatArray:
+        """A covariance (d, d) shrunk where it is wider than the prior, so that steps of one deviation stay inside."""
+        sd = np.sqrt(np.diag(covariance))
+        shrunk = np.minimum(1.0, np.minimum(_STEP_SHARE * (self.high - self.low), self.sd) / sd)
+        return np.asarray(covariance * np.outer(shrunk, shrunk))
+
+    def restricted(self, priors: Mapping[LensParameterName, ParameterPrior]) -> Prior:
+        """The same with the prior of some parameters replaced; an angle is taken modulo pi, nearest to the middle.
+
+        Raises
+        ------
+        SpecError
+            A parameter is not one of these, or nothing is left between its bounds.
+        """
+        low, high, mean, sd = (array.copy() for array in (self.low, self.high, self.mean, self.sd))
+        for name, prior in priors.items():
+            if name not in self.names:
+                raise SpecError("priors", name, f"one of {', '.join(self.names)} for this lens model")
+            k = self.names.index(name)
+            middle = 0.5 * (self.low[k] + self.high[k])
+            given = [value for value in (prior.low, prior.high) if value is not None]
+            turn = _turns(prior.mean if prior.mean is not None else sum(given) / len(given), middle, name)
+            least, most = _LIMITS.get(name, (-math.inf, math.inf))
+            low[k] = max(self.low[k] if prior.low is None else prior.low + turn, least)
+            high[k] = min(self.high[k] if prior.high is None else prior.high + turn, most)
+            if prior.mean is not None and prior.sd is not None:
+                mean[k], sd[k] = prior.mean + turn, prior.sd
+            if not low[k] < high[k]:
+                raise SpecError(f"priors.{name}", (float(low[k]), float(high[k])), "bounds with something between them")
+        return Prior(self.names, low, high, mean, sd)
+
+
+def _turns(value: float, middle: float, name: str) -> float:
+    """What brings an angle within half a turn of the middle; nothing for other parameters."""
+    return middle + math.remainder(value - middle, math.pi) - value if name == "phi" else 0.0
+
+
+def wide_prior(lens: PowerLawLens, ln_lambda: float, *, shear: bool) -> Prior:
+    """The prior round a starting lens where nothing else is asked for.
 
     theta_E within 30 %, q in (0.2, 1), the angle within 90 degrees, slope in (1.3, 2.7), the centre within 0.3
     arcsec, shear components within 0.4, ln lambda within 20 of the start: far wider than any posterior of the study.
@@ -43,16 +112,20 @@ def flat_prior(lens: PowerLawLens, ln_lambda: float, *, shear: bool) -> Prior:
     names: tuple[str, ...] = LENS_NAMES
     if shear:
         names, low, high = names + SHEAR_NAMES, [*low, -0.4, -0.4], [*high, 0.4, 0.4]
-    return Prior((*names, STRENGTH), np.array([*low, ln_lambda - 20.0]), np.array([*high, ln_lambda + 20.0]))
+    return Prior.flat((*names, STRENGTH), np.array([*low, ln_lambda - 20.0]), np.array([*high, ln_lambda + 20.0]))
 
 
 @dataclass
 class Target:
-    """ln posterior up to a constant; counts its evidence evaluations and the inversions that were refused."""
+    """ln posterior up to a constant; counts its evidence evaluations and the inversions that were refused.
+
+    With ``agn``, the positions of the AGN images are data too.
+    """
 
     operator: Operator
     prior: Prior
     source: SourceModel
+    agn: AgnPositions | None = None
     evaluations: int = field(default=0, init=False)
     refused: int = field(default=0, init=False)
 
@@ -65,12 +138,14 @@ class Target:
         return np.array([*(getattr(lens, name) for name in self.prior.names[:-1]), ln_lambda])
 
     def __call__(self, values: FloatArray) -> float:
-        """Ln Z + ln prior; minus infinity outside the prior, and where the inversion is refused (counted)."""
+        """Ln Z + ln prior, and that of the AGN positions; minus infinity outside, or if refused (counted)."""
         if not self.prior.holds(values):
             return -math.inf
         self.evaluations += 1
+        lens = self.lens(values)
+        rest = self.prior.ln_density(values) + (0.0 if self.agn is None else self.agn.ln_likelihood(lens))
         try:
-            return ln_evidence(self.operator, self.lens(values), float(values[-1]), self.source)
+            return rest + ln_evidence(self.operator, lens, float(values[-1]), self.source)
         except InversionError:
             self.refused += 1
             return -math.inf

@@ -17,7 +17,7 @@ from engine.lensing.power_law import kernel_arguments, source_position
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.modelling.parametric import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
-from engine.posterior.target import Target, flat_prior
+from engine.posterior.target import Target, wide_prior
 from engine.simulation import Simulation, simulate_realization
 from engine.spec import Analysis, Host, Realization
 from tests.engine.dense_oracle import LENS, Case
@@ -120,7 +120,7 @@ def test_noise_free_data_are_left_well_below_the_noise(seen: tuple[Simulation, P
 def test_the_evidence_peaks_at_the_true_lens_within_its_own_width(seen: tuple[Simulation, ParametricFit]) -> None:
     simulation, fit = seen
     operator = prepare_problem(simulation.observation, fit, Analysis()).operator
-    target = Target(operator, flat_prior(fit.lens, -10.0, shear=False), MODEL)
+    target = Target(operator, wide_prior(fit.lens, -10.0, shear=False), MODEL)
     start = target.vector(fit.lens, optimal_strength(target, fit.lens))
     found = find_optimum(target, start, start_covariance(fit.lens_covariance))
     away = (found.mean - target.vector(simulation.scene.lens, 0.0))[:-1]
