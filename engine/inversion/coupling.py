@@ -66,9 +66,9 @@ class PixelCoupling:
         out = np.zeros_like(placed)
         for patch in range(patches):
             some = slice(self.start[patch], self.start[patch + 1])
-            rows, blocks = self.row_patch[some], self.blocks[some]
-            out[rows] += blocks @ placed[patch]
-            out[patch] += np.einsum("bij,bik->jk", blocks, placed[rows], optimize=True)
+            rows, column = self.row_patch[some], self.blocks[some].reshape(-1, TILE)
+            out[rows] += (column @ placed[patch]).reshape(rows.size, TILE, count)
+            out[patch] += column.T @ placed[rows].reshape(-1, count)
         result = np.empty_like(images)
         result[self.order] = out.reshape(-1, count)[: self.order.size]
         return result
