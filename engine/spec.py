@@ -340,7 +340,8 @@ class Analysis:
     for ``max_steps``.
     ``regularisation_length`` is the correlation length of ``matern`` [source pixels], without effect otherwise.
     ``priors`` of the lens parameters, by name, come before those of the system. With ``agn_position_sd`` [arcsec per
-    axis] the measured positions of the AGN images have to come from one point of the source plane.
+    axis] the measured positions of the AGN images have to come from one point of the source plane. ``background_sd``
+    [e-/s in a pixel] is how well the sky was taken off before; where None the background is free.
     """
 
     profile: ProfileName = "standard"
@@ -362,6 +363,7 @@ class Analysis:
     draws: Annotated[int, Field(ge=2, le=1000)] = 30
     priors: Priors = Field(default_factory=dict)
     agn_position_sd: Annotated[float, Field(ge=1e-5, le=1.0)] | None = None
+    background_sd: Annotated[float, Field(ge=1e-9, le=1e9)] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -407,8 +409,9 @@ class Realization:
             del dumped["optics"]
         if dumped["analysis"]["regularisation"] != "matern":
             del dumped["analysis"]["regularisation_length"]
-        if dumped["analysis"]["agn_position_sd"] is None:
-            del dumped["analysis"]["agn_position_sd"]
+        for name in ("agn_position_sd", "background_sd"):
+            if dumped["analysis"][name] is None:
+                del dumped["analysis"][name]
         for holder in (dumped["analysis"], dumped["system"]):
             if isinstance(holder, dict) and not holder["priors"]:
                 del holder["priors"]

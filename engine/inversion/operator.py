@@ -1,8 +1,8 @@
 """What an observation contributes to the evidence, computed once: B^T C^-1 B in blocks, B^T P d and the constants.
 
-P = C^-1 - C^-1 U (U^T C^-1 U)^-1 U^T C^-1 marginalises the amplitudes. B^T C^-1 B is sparse, since pixels far apart do
-not share light, but B^T P B is not: the amplitudes are kept as a border T (P, k) with B^T P B = B^T C^-1 B - T T^T.
-Neither C^-1 nor any other matrix of M x M, M x P or P x P is ever formed.
+P = C^-1 - C^-1 U (U^T C^-1 U + L)^-1 U^T C^-1 marginalises the amplitudes, L the precision of their prior. B^T C^-1 B
+is sparse, since pixels far apart do not share light, but B^T P B is not: the amplitudes are kept as a border T (P, k)
+with B^T P B = B^T C^-1 B - T T^T. Neither C^-1 nor any other matrix of M x M, M x P or P x P is ever formed.
 """
 
 from __future__ import annotations
@@ -25,20 +25,30 @@ class LinearData:
     """Data on the mask: d (M,), amplitude columns U (M, k), and the noise.
 
     The ``covariance`` is variances (M,) or a matrix (M, M), which is best sparse: drizzling correlates neighbours only.
+    ``precisions`` (k,) are those of the Gaussian priors round zero of the amplitudes, zero where the prior is flat, as
+    all are where None.
     """
 
     data: FloatArray
     covariance: FloatArray | sparse.spmatrix
     columns: FloatArray
+    precisions: FloatArray | None = None
+
+    def prior_rows(self) -> FloatArray:
+        """Amplitudes in units of their priors' deviations, a row (k,) for each that has one: data that are zero."""
+        k = self.columns.shape[1]
+        precisions = np.zeros(k) if self.precisions is None else self.precisions
+        return np.diag(np.sqrt(precisions))[precisions > 0.0]
 
 
 @dataclass(frozen=True)
 class WhitenedData:
-    """d (M,) and U (M, k) divided by the Cholesky factor of C, and that factor."""
+    """d (M,) and U (M, k) divided by the Cholesky factor of C, that factor, and the rows (r, k) of the priors."""
 
     data: FloatArray
     columns: FloatArray
     noise: NoiseFactor
+    priors: FloatArray
 
     @property
     def covariance(self) -> FloatArray:
@@ -68,7 +78,8 @@ class Operator:
     dd : float
         d^T P d.
     ln_constant : float
-        -1/2 ln|C| - 1/2 ln|U^T C^-1 U| - (M - k)/2 ln 2 pi.
+        -1/2 ln|C| - 1/2 ln|U^T C^-1 U + L| + 1/2 ln|L| - (M - k + r)/2 ln 2 pi, L the precisions of the priors of r
+        amplitudes (ln|L| over these).
     data_points, amplitudes : int
         M and k.
     blurring : sparse array (M, P)
@@ -95,7 +106,9 @@ class Operator:
     def fit_amplitudes(self, arc: FloatArray) -> FloatArray:
         """Best amplitudes (k,) for a given model of the lensed host on the mask (M,)."""
         rest = self.whitened.data - self.whitened.noise.whiten(arc)
-        solution, *_ = linalg.lstsq(self.whitened.columns, rest)
+        priors = self.whitened.priors
+        columns = np.vstack([self.whitened.columns, priors])
+        solution, *_ = linalg.lstsq(columns, np.concatenate([rest, np.zeros(len(priors))]))
         return np.asarray(solution)
 
     def chi2(self, arc: FloatArray, amplitudes: FloatArray) -> float:
@@ -125,6 +138,7 @@ def build_operator(linear: LinearData, blurring: sparse.spmatrix | FloatArray, r
     """
     m = linear.data.size
     covariance = linear.covariance.data if sparse.issparse(linear.covariance) else linear.covariance
+    priors = linear.prior_rows()
     for name, values in (("data", linear.data), ("noise", covariance), ("amplitudes", linear.columns)):
         if not np.isfinite(values).all():
             raise InversionError(f"{name}: not finite in some pixels of the mask; leave them out of it")
@@ -133,11 +147,13 @@ def build_operator(linear: LinearData, blurring: sparse.spmatrix | FloatArray, r
     white_d = noise.whiten(linear.data)
     k = linear.columns.shape[1]
     white_u = noise.whiten(linear.columns)
-    ln_u = 0.0
+    ln_u, ln_l = 0.0, 2.0 * float(np.log(priors.max(axis=1, initial=0.0)).sum())
     projected_d = white_d
     border = np.zeros((blurring.shape[1], 0))
     if k:
-        q, r = np.linalg.qr(white_u)
+        # An amplitude's prior is one datum more, which knows nothing else: only its part in the others is kept of q.
+        q, r = np.linalg.qr(np.vstack([white_u, priors]))
+        q = q[:m]
         pivots = np.abs(np.diag(r))
         if not pivots.min() > 1e-10 * pivots.max():
             raise InversionError("amplitudes: their columns are not independent on the mask; leave one out")
@@ -149,10 +165,10 @@ def build_operator(linear: LinearData, blurring: sparse.spmatrix | FloatArray, r
         coupling=couple_pixels(blurring, noise, rays),
         border=border,
         wd=np.asarray(blurring.T @ noise.whiten_transposed(projected_d)),
-        dd=float(projected_d @ projected_d),
-        ln_constant=-0.5 * (noise.ln_determinant + ln_u + (m - k) * math.log(2.0 * math.pi)),
+        dd=float(white_d @ projected_d),
+        ln_constant=-0.5 * (noise.ln_determinant + ln_u - ln_l + (m - k + len(priors)) * math.log(2.0 * math.pi)),
         data_points=m,
         amplitudes=k,
         blurring=blurring,
-        whitened=WhitenedData(white_d, white_u, noise),
+        whitened=WhitenedData(white_d, white_u, noise, priors),
     )

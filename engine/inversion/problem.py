@@ -75,6 +75,12 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
     return tuple(names), np.stack(images)
 
 
+def _precisions(names: tuple[str, ...], analysis: Analysis) -> FloatArray:
+    """Precisions (k,) of the amplitudes' priors: all flat, but the background's where the sky is known."""
+    sd = analysis.background_sd
+    return np.array([0.0 if sd is None or name != "background" else sd**-2 for name in names])
+
+
 def _noise(
     observation: Observation, fit: ParametricFit, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
 ) -> FloatArray | sparse.csr_matrix:
@@ -178,6 +184,7 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
         data=observation.image[mask],
         covariance=_noise(observation, fit, analysis, mask, core),
         columns=np.ascontiguousarray(images[:, mask].T),
+        precisions=_precisions(names, analysis),
     )
     operator = build_operator(linear, blurring, rays)
     return Problem(operator=operator, mask=mask, core=core, amplitude_names=names, amplitude_images=images)

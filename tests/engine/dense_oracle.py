@@ -25,6 +25,7 @@ class Case:
         subrays: int = 2,
         amplitudes: int = 3,
         correlated: bool = False,
+        amplitude_sd: float | None = None,
         seed: int = 0,
     ) -> None:
         rng = np.random.default_rng(seed)
@@ -63,7 +64,11 @@ class Case:
         self.data = (
             self.blurring @ mapping.apply(source.ravel()) + self.columns.sum(axis=1) + sigma * rng.normal(size=m)
         )
-        self.linear = LinearData(self.data, self.covariance, self.columns)
+        # The last amplitude alone has a Gaussian prior.
+        self.precisions = np.zeros(amplitudes)
+        if amplitude_sd is not None:
+            self.precisions[-1] = amplitude_sd**-2
+        self.linear = LinearData(self.data, self.covariance, self.columns, self.precisions)
 
     def operator(self) -> Operator:
         return build_operator(self.linear, self.blurring, self.rays)
@@ -78,9 +83,12 @@ class Case:
         h = regularisation_matrix(model)
         a = g.T @ inverse @ g
         a[:n, :n] += math.exp(ln_lambda) * h
+        a[n:, n:] += np.diag(self.precisions)
         d = g.T @ inverse @ self.data
         solution = np.linalg.solve(a, d)
         value = -0.5 * (self.data @ inverse @ self.data - d @ solution)
         value += -0.5 * np.linalg.slogdet(a)[1] + 0.5 * np.linalg.slogdet(h)[1] + 0.5 * n * ln_lambda
         value += -0.5 * np.linalg.slogdet(c)[1] - 0.5 * (m - k) * math.log(2 * math.pi)
+        proper = self.precisions[self.precisions > 0]
+        value += 0.5 * np.log(proper / (2 * math.pi)).sum()
         return float(value), solution, np.linalg.inv(a)

@@ -25,6 +25,8 @@ CASES = [
     {"subrays": 3, "amplitudes": 6},
     {"amplitudes": 0},
     {"correlated": True},
+    {"amplitude_sd": 0.02},
+    {"amplitude_sd": 0.3, "correlated": True},
     {"correlated": True, "amplitudes": 0, "mask": "holes"},
 ]
 MODELS = [

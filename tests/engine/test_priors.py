@@ -15,7 +15,7 @@ from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.target import Target, wide_prior
-from engine.run import analysis_of
+from engine.run import Truth, analysis_of
 from engine.spec import ParameterPrior, realization_from_dict
 from tests.engine.dense_oracle import Case
 
@@ -111,6 +111,7 @@ def test_what_is_not_used_leaves_the_digest_alone() -> None:
     plain = realization()
     assert "priors" not in plain.to_dict()["analysis"]
     assert "agn_position_sd" not in plain.to_dict()["analysis"]
+    assert "background_sd" not in plain.to_dict()["analysis"]
     with_prior = realization(priors={"slope": ParameterPrior(mean=2.0, sd=0.1)}, agn_position_sd=0.003)
     assert with_prior.digest != plain.digest
     assert with_prior.observation_digest == plain.observation_digest
@@ -152,3 +153,23 @@ def test_a_run_takes_the_systems_priors_where_it_states_none() -> None:
     assert stated.priors["slope"] == ParameterPrior(mean=2.0, sd=0.1)
     assert stated.priors["q"] == load_system(SYSTEM).priors["q"]
     assert analysis_of(realization()).priors == load_system(SYSTEM).priors
+
+
+def test_a_known_background_is_held_and_gives_the_host_its_wings_back() -> None:
+    """The simulation's sky is taken off exactly. A free background of the ring takes 0.3 mag of `paper`'s host."""
+    simulation = simulate_realization(realization())
+    bias = {}
+    for name, sd in (("free", None), ("known", 1e-3)):
+        analysis = realization(background_sd=sd, draws=10, max_steps=60).analysis
+        found = measure(
+            simulation.observation,
+            analysis,
+            np.random.default_rng(1),
+            agn_images=len(simulation.scene.agn),
+            truth=Truth(simulation.scene.lens, simulation.scene.host),
+        )
+        paper = next(e for e in found.estimates if (e.estimator, e.index_prior) == ("paper", "wide"))
+        bias[name] = paper.magnitude.bias
+    assert bias["free"] is not None
+    assert bias["known"] is not None
+    assert abs(bias["known"]) < 0.1 < bias["free"]
