@@ -430,7 +430,9 @@ class Dispatcher:
                 self._done.put(flight.future.key)  # in case the callback was lost
         self._stop_workers_of(overdue_flights)
         carried = set() if stranded else set(self._heartbeat.engines)
-        self._give_back(self._ahead.take_engines_but(carried), Outcome.FORGOTTEN)
+        # While all workers are being started anew nothing is carried for a moment: what was claimed for them waits.
+        if carried or stranded:
+            self._give_back(self._ahead.take_engines_but(carried), Outcome.FORGOTTEN)
         self._write_endings()
         known = [flight.lease for flight in (*self._flights.values(), *self._deaths.waiting)]
         self._queue.requeue_forgotten(self._generation, [lease.run_id for lease in (*known, *self._ahead)])

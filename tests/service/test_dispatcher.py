@@ -230,6 +230,18 @@ def test_workers_that_are_away_for_a_moment_keep_their_runs_and_ones_that_stay_a
     assert setting.grids.grid(setting.grid_id).counts.done == 2
 
 
+def test_what_was_claimed_ahead_waits_while_all_workers_are_started_anew(database: Database, tmp_path: Path) -> None:
+    pool = InstantPool(tmp_path, "pending", "pending")
+    setting = Setting(database, pool, runs=6, reconcile_s=0.001)
+    setting.dispatcher._brief = True
+    setting.run(until=lambda: setting.grids.grid(setting.grid_id).counts.leased == 4)
+    pool.addresses = []
+    setting.run(steps=2)
+    assert setting.grids.grid(setting.grid_id).counts.leased == 4
+    setting.run(steps=4)
+    assert setting.grids.grid(setting.grid_id).counts.queued == 6, "without workers for long it is given back"
+
+
 def outcomes(setting: Setting) -> list[list[str]]:
     runs = setting.grids.runs(setting.grid_id, 100).items
     return [[end.outcome for end in setting.grids.run(run.id).attempts] for run in runs]
