@@ -1,8 +1,8 @@
 """All estimators on all draws of one chain.
 
-The fits of an estimator start from one reference fit, that of the first draw, which starts from the estimator before:
-the mean source is fitted first, from its moments. The widest range of n is fitted first; where a draw's fit lies
-within a narrower range, it is that range's fit too.
+The fits of an estimator start from one reference fit, that of the first draw, and from the centres that the estimator
+before found for each draw: the mean source is fitted first, from its moments. The widest range of n is fitted first;
+where a draw's fit lies within a narrower range, it is that range's fit too.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from engine.refits.draws import DrawSet, SourceDraw
 from engine.refits.image import ImageMetric
 from engine.refits.least_squares import Fits, Metric, fit_shapes, scatter
 from engine.refits.paper import PaperMetric
-from engine.refits.profiles import LN_R_EFF, N, profile_of
+from engine.refits.profiles import LN_R_EFF, N, X, Y, profile_of
 from engine.refits.projected import ProjectedMetric
 from engine.result import INDEX_RANGES, EstimatorName, IndexPrior
 
@@ -105,10 +105,12 @@ def _metric(estimator: EstimatorName, drawn: DrawSet) -> Metric:
             return ImageMetric(drawn.operator, drawn.draws)
 
 
-def _fit(metric: Metric, start: FloatArray, bounds: _Bounds, wider: Fits | None) -> Fits:
-    """Fit the first draw from ``start`` (6,) and all draws from there.
+def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None) -> Fits:
+    """Fit the first draw from its start, and all draws from there, each with the centre of its own start (K, 6).
 
-    With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that fit.
+    The lens moves the source between the draws: against a peaked profile elsewhere the fit would rather blunt it than
+    move it. With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that
+    fit.
     """
     if wider is not None:
         outside = np.flatnonzero(~bounds.hold(wider.shapes))
@@ -117,8 +119,10 @@ def _fit(metric: Metric, start: FloatArray, bounds: _Bounds, wider: Fits | None)
         low, high = bounds.low[outside], bounds.high[outside]
         return wider.replaced(outside, fit_shapes(metric, outside, wider.shapes[outside], low, high))
     every = np.arange(len(bounds.low))
-    reference = fit_shapes(metric, every[:1], start[None], bounds.low[:1], bounds.high[:1]).shapes
-    return fit_shapes(metric, every, np.repeat(reference, every.size, axis=0), bounds.low, bounds.high)
+    reference = fit_shapes(metric, every[:1], starts[:1], bounds.low[:1], bounds.high[:1]).shapes[0]
+    moved = np.repeat(reference[None], every.size, axis=0)
+    moved[:, (X, Y)] += starts[:, (X, Y)] - starts[0, (X, Y)]
+    return fit_shapes(metric, every, moved, bounds.low, bounds.high)
 
 
 def _flagged(fits: Fits, shapes: FloatArray, fluxes: FloatArray, bounds: _Bounds) -> tuple[SersicFit | None, ...]:
@@ -149,7 +153,7 @@ def refit_draws(
     if fixed_index is not None:
         ranges["fixed"] = (fixed_index, fixed_index)
     bounds = {prior: _Bounds.of(drawn.draws, index_range) for prior, index_range in ranges.items()}
-    start = _first_start(drawn.draws[0], bounds["wide"])
+    starts = np.repeat(_first_start(drawn.draws[0], bounds["wide"])[None], len(drawn.draws), axis=0)
     seeds = [int(seed) for seed in rng.integers(2**63, size=len(drawn.draws))]
     every = np.arange(len(drawn.draws))
     out = []
@@ -158,10 +162,10 @@ def refit_draws(
         wide: Fits | None = None
         spread: tuple[FloatArray, FloatArray] | None = None
         for prior, inside in bounds.items():
-            fits = _fit(metric, start, inside, wide if prior == "free" else None)
+            fits = _fit(metric, starts, inside, wide if prior == "free" else None)
             if prior == "wide":
                 wide = fits
-                start = np.asarray(fits.shapes[0] if fits.fluxes[0] > 0 else start)
+                starts = np.where((fits.fluxes > 0)[:, None], fits.shapes, starts)
             # The same random numbers for every prior: what differs between them is not chance, and scatter that stays
             # within a narrower range need not be drawn again.
             if not (fits is wide and spread is not None and inside.hold(spread[0]).all()):
