@@ -26,6 +26,8 @@ from engine.refits.projected import ProjectedMetric
 from engine.result import INDEX_RANGES, EstimatorName, IndexPrior
 
 _BOUND_MARGIN = 1e-3
+_FAR = 25.0
+"""Half the chi^2 above the other draws from which a fit is taken to be stuck: draws of one posterior differ by 10."""
 _START_INDICES = (0.8, 2.0, 4.0)
 _DATA_ESTIMATORS: tuple[EstimatorName, ...] = ("projected", "image")
 """Their chi^2 is that of the data: the source's own scatter is not in the draws that they see, it is added."""
@@ -105,11 +107,12 @@ def _metric(estimator: EstimatorName, drawn: DrawSet) -> Metric:
             return ImageMetric(drawn.operator, drawn.draws)
 
 
-def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None) -> Fits:
+def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None, *, of_data: bool) -> Fits:
     """Fit the first draw from its start, and all draws from there, each with the centre of its own start (K, 6).
 
     The lens moves the source between the draws: against a peaked profile elsewhere the fit would rather blunt it than
-    move it. With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that
+    move it. A fit that does not end, or ends far above the others where their chi^2 is that of the same data, is tried
+    alone. With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that
     fit.
     """
     if wider is not None:
@@ -122,7 +125,16 @@ def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None
     reference = fit_shapes(metric, every[:1], starts[:1], bounds.low[:1], bounds.high[:1]).shapes[0]
     moved = np.repeat(reference[None], every.size, axis=0)
     moved[:, (X, Y)] += starts[:, (X, Y)] - starts[0, (X, Y)]
-    return fit_shapes(metric, every, moved, bounds.low, bounds.high)
+    fits = fit_shapes(metric, every, moved, bounds.low, bounds.high)
+    lost = ~fits.converged
+    if of_data:
+        lost |= fits.value > np.median(fits.value) + _FAR
+    for k in np.flatnonzero(lost):
+        # With its own curvature, which a metric may have shared until now.
+        again = fit_shapes(metric, every[k : k + 1], moved[k : k + 1], bounds.low[k : k + 1], bounds.high[k : k + 1])
+        if again.value[0] < fits.value[k]:
+            fits = fits.replaced(every[k : k + 1], again)
+    return fits
 
 
 def _flagged(fits: Fits, shapes: FloatArray, fluxes: FloatArray, bounds: _Bounds) -> tuple[SersicFit | None, ...]:
@@ -158,11 +170,11 @@ def refit_draws(
     every = np.arange(len(drawn.draws))
     out = []
     for estimator in estimators:
-        metric = _metric(estimator, drawn)
+        metric, added = _metric(estimator, drawn), estimator in _DATA_ESTIMATORS
         wide: Fits | None = None
         spread: tuple[FloatArray, FloatArray] | None = None
         for prior, inside in bounds.items():
-            fits = _fit(metric, starts, inside, wide if prior == "free" else None)
+            fits = _fit(metric, starts, inside, wide if prior == "free" else None, of_data=added)
             if prior == "wide":
                 wide = fits
                 starts = np.where((fits.fluxes > 0)[:, None], fits.shapes, starts)
@@ -170,7 +182,6 @@ def refit_draws(
             # within a narrower range need not be drawn again.
             if not (fits is wide and spread is not None and inside.hold(spread[0]).all()):
                 generators = [np.random.default_rng(seed) for seed in seeds]
-                added = estimator in _DATA_ESTIMATORS
                 spread = (
                     scatter(metric, every, fits, inside.low, inside.high, generators)
                     if added

@@ -52,12 +52,13 @@ class Metric(Protocol):
 class Fits:
     """Fits of K draws.
 
-    ``shapes`` (K, 6); ``fluxes`` (K,), which may be negative; ``gradient`` (K, 6) and ``hessian`` (K, 6, 6) of half the
-    chi^2 by the shape, flux profiled out; ``converged`` (K,).
+    ``shapes`` (K, 6); ``fluxes`` (K,), which may be negative; ``value`` (K,), ``gradient`` (K, 6) and ``hessian``
+    (K, 6, 6) of half the chi^2 by the shape, flux profiled out and a constant left out; ``converged`` (K,).
     """
 
     shapes: FloatArray
     fluxes: FloatArray
+    value: FloatArray
     gradient: FloatArray
     hessian: FloatArray
     converged: NDArray[np.bool_]
@@ -160,7 +161,7 @@ def fit_shapes(metric: Metric, which: NDArray[np.intp], starts: FloatArray, low:
         damping[active] = np.clip(damping[active] * np.where(better, _CALMER, _STRONGER), _MIN_DAMPING, None)
         # No step is small enough any more: rounding, or a metric that is not smooth at this scale.
         done[active[damping[active] > _MAX_DAMPING]] = True
-    return Fits(point, best.flux, best.gradient, best.hessian, done)
+    return Fits(point, best.flux, best.value, best.gradient, best.hessian, done)
 
 
 def scatter(

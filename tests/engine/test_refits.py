@@ -23,7 +23,7 @@ from engine.refits.least_squares import fit_shapes, scatter
 from engine.refits.profiles import columns_on_grid, profile_of, profile_on_grid, shape_of
 from engine.refits.projected import ProjectedMetric
 from engine.refits.summaries import summarise, summarise_aperture
-from engine.result import EstimatorName
+from engine.result import ESTIMATORS, EstimatorName
 from engine.run import Truth, _refit
 from engine.simulation import Simulation
 from tests.engine.dense_oracle import LENS, Case
@@ -165,6 +165,26 @@ def test_what_the_draws_share_does_not_move_their_fits() -> None:
         # Each ends within 0.05 of a standard deviation of the minimum; the curvature is the first draw's.
         assert np.abs((shared.shapes[k] - own.shapes[0]) / sd).max() < 0.1
         assert np.sqrt(np.diag(np.linalg.inv(shared.hessian[k]))) == pytest.approx(sd, rel=0.15)
+
+
+@pytest.mark.parametrize("shift", [0.005, 0.01])
+def test_a_peaked_host_is_found_behind_lenses_that_move_it(shift: float) -> None:
+    """Each lens moves the source by some of its cores: a fit that begins elsewhere blunts the peak."""
+    host = replace(HOST, n=4.0)
+    operator = ray_traced(Case(amplitudes=2), host)
+    rng = np.random.default_rng(0)
+    lenses = [
+        LENS.with_values(x=LENS.x + shift * i, y=LENS.y + shift * j) for i, j in ((0, 0), (2, 1), (-2, 1), (1, -2))
+    ]
+    draws = [source_draw(invert(operator, lens, -2.0, SourceModel((14, 14))), lens, rng) for lens in lenses]
+    together = refits(draws, operator, ESTIMATORS)
+    for k, draw in enumerate(draws):
+        alone = refits([draw], operator, ESTIMATORS)["image", "wide"].fits[0]
+        fit = together["image", "wide"].fits[k]
+        assert fit is not None
+        assert alone is not None
+        assert fit.profile.r_eff == pytest.approx(alone.profile.r_eff, rel=0.05)
+        assert fit.profile.n == pytest.approx(alone.profile.n, abs=0.2)
 
 
 def test_the_ray_traced_model_is_the_noise_free_arc(simulation: Simulation) -> None:
