@@ -23,7 +23,7 @@ from engine.inspection import InversionView, inspect_inversion, inspect_simulati
 from engine.measurement import HostEstimate, ImageMeasurement, Measured, measure_image
 from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, measure, run
-from engine.scene import check_system
+from engine.scene import check_analysis, check_system
 from engine.seeds import generator
 from engine.simulation import Simulation, simulate_realization
 from engine.spec import (
@@ -35,6 +35,7 @@ from engine.spec import (
     LensSystem,
     NoiseLevel,
     Optics,
+    ParameterPrior,
     Realization,
     SystemChoice,
     camera_from_mapping,
@@ -71,6 +72,7 @@ __all__ = [
     "Observation",
     "ObservationError",
     "Optics",
+    "ParameterPrior",
     "PosteriorError",
     "Products",
     "Quantity",
@@ -83,6 +85,7 @@ __all__ = [
     "Truth",
     "camera_from_mapping",
     "camera_names",
+    "check_analysis",
     "check_system",
     "engine_digest",
     "engine_versions",

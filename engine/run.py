@@ -46,6 +46,7 @@ from engine.result import (
     RunResult,
     StageTime,
 )
+from engine.scene import check_analysis
 from engine.seeds import generator
 from engine.simulation import simulate_realization
 from engine.spec import NOMINAL_OPTICS, Analysis, Realization
@@ -312,6 +313,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
     EngineError
         The run has no trustworthy result; the message says why.
     """
+    check_analysis(realization)
     watch = _Stopwatch(progress)
     # One thread: a worker is given one core, and sums in a fixed order give the same bits everywhere.
     with threadpool_limits(1):

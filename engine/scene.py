@@ -91,6 +91,21 @@ def check_system(system: LensSystem) -> None:
                 )
 
 
+def check_analysis(realization: Realization) -> None:
+    """Refuse an analysis that asks for what the system has not.
+
+    Priors of the shear need a mass model with shear, positions as data two AGN images; a SpecError names the field.
+    """
+    system, analysis = resolve_system(realization), realization.analysis
+    mass = system.mass_model(realization.mass_model, realization.l_eta)
+    if not any(mass.shear or ()):
+        for name in ("gamma1", "gamma2"):
+            if name in analysis.priors or name in system.priors:
+                raise SpecError("analysis.priors", name, f"a lens parameter of {system.name}, whose model has no shear")
+    if analysis.agn_position_sd is not None and len(system.agn) < 2:
+        raise SpecError("analysis.agn_position_sd", analysis.agn_position_sd, "nothing: there are no two AGN images")
+
+
 def power_law_lens(mass: MassModel) -> PowerLawLens:
     """A catalogue's mass model in the image frame."""
     x, y = sky_to_image(mass.centre)

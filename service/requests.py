@@ -23,6 +23,7 @@ from engine import (
     SpecError,
     SystemChoice,
     camera_names,
+    check_analysis,
     check_system,
     engine_digest,
     expand,
@@ -122,6 +123,8 @@ def plan(request: GridRequest, max_runs: int) -> list[PlannedRun]:
     single = expand(_grid(request, replicates=1))
     _limit(len(single) * request.replicates, max_runs)
     _check_own_systems(request)
+    for run in single:
+        check_analysis(run.realization)
     runs = single if request.replicates == 1 else expand(_grid(request, request.replicates))
     return [_planned(run) for run in runs]
 

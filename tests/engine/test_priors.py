@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from engine import Analysis, Host, Realization, SpecError, load_system, measure, simulate_realization
+from engine import Analysis, Host, Realization, SpecError, check_analysis, load_system, measure, simulate_realization
 from engine.catalogue import system_names
 from engine.inversion.evidence import ln_evidence
 from engine.inversion.regularisation import SourceModel
@@ -105,6 +106,16 @@ def test_a_prior_of_what_the_model_has_not_is_refused() -> None:
         wide.restricted({"gamma1": ParameterPrior(low=0.0)})
     with pytest.raises(SpecError, match=r"priors\.q"):
         wide.restricted({"q": ParameterPrior(low=1.2)})
+
+
+def test_what_the_system_has_not_is_refused_before_anything_is_computed() -> None:
+    with pytest.raises(SpecError, match=r"analysis\.priors.*gamma1.*no shear"):
+        check_analysis(realization(priors={"gamma1": ParameterPrior(low=0.0)}))
+    sheared = replace(realization(priors={"gamma1": ParameterPrior(low=0.0)}), system="RXJ1131")
+    check_analysis(sheared)
+    single = replace(load_system(SYSTEM), agn=())
+    with pytest.raises(SpecError, match="agn_position_sd"):
+        check_analysis(replace(realization(agn_position_sd=0.01), system=single))
 
 
 def test_what_is_not_used_leaves_the_digest_alone() -> None:

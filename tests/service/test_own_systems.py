@@ -87,6 +87,27 @@ def test_a_wrong_own_system_is_refused_with_a_pointer_to_the_field(
     assert told in places[pointer]
 
 
+def test_priors_are_taken_and_those_of_what_the_lens_has_not_are_refused(api: TestClient) -> None:
+    def post(analysis: dict[str, Any]) -> Any:
+        return api.post("/v1/grids", json={"preset": "h0licow-vi/HE0435", "l_eta": [1.0], "analysis": analysis})
+
+    asked = {"priors": {"slope": {"mean": 2.0, "sd": 0.1}}, "agn_position_sd": 0.003, "background_sd": 0.001}
+    taken = post(asked)
+    assert taken.status_code == 202, taken.text
+    run = api.get(taken.json()["links"]["self"] + "/runs").json()["items"][0]
+    spec = api.get(f"/v1/runs/{run['id']}").json()["spec"]["analysis"]
+    assert spec["priors"]["slope"]["mean"] == 2.0
+    assert (spec["agn_position_sd"], spec["background_sd"]) == (0.003, 0.001)
+    for wrong, field in (
+        ({"priors": {"gamma2": {"high": 0.1}}}, "/analysis/priors"),
+        ({"priors": {"slope": {"low": 2.1, "high": 1.9}}}, "/analysis/priors/slope"),
+        ({"agn_position_sd": 0}, "/analysis/agn_position_sd"),
+    ):
+        refused = post(wrong)
+        assert refused.status_code == 422
+        assert refused.json()["errors"][0]["pointer"] == field
+
+
 def command(*arguments: str) -> Any:
     return CliRunner().invoke(app, list(arguments))
 
