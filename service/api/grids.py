@@ -7,6 +7,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
+from pydantic_core import to_json
 
 from engine import engine_digest
 from service.api.context import GridId, Limit, RunId, Service
@@ -88,7 +89,7 @@ def list_runs(
     return page.model_copy(update={"next": next_link(request, response, page.next)})
 
 
-@router.get("/grids/{grid_id}/summary")
+@router.get("/grids/{grid_id}/summary", response_model=Summary)
 def summary(
     request: Request,
     response: Response,
@@ -96,10 +97,12 @@ def summary(
     service: Service,
     limit: Limit = 100,
     cursor: Ordinal = 0,
-) -> Summary:
+) -> Response:
     """Recovered values and biases by input, and over the whole grid."""
     found = summarise(service.database, service.grids.grid(grid_id), limit, cursor)
-    return found.model_copy(update={"next": next_link(request, response, found.next)})
+    found["next"] = next_link(request, response, found["next"])
+    # Written at once: by way of the model every number of the page would be checked before.
+    return Response(to_json(found), media_type="application/json", headers=dict(response.headers))
 
 
 @router.post("/grids/{grid_id}/cancel")

@@ -3,101 +3,131 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Row, RowMapping, select
 
 from service.payload import ESTIMATES
-from service.schemas import (
-    GridView,
-    OverallEstimate,
-    OverallValue,
-    Summary,
-)
+from service.schemas import GridView
 from service.store.database import Database
-from service.store.tables import COUNTED, GROUP_COLUMNS, INPUT_COLUMNS, SUMMED, grid_sum, input_sum
+from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_sum, input_sum
 
-_INPUTS = frozenset(INPUT_COLUMNS)
+_PARTS = ("shift", "shift2", "sd", "bias", "bias_runs")
+# In the order in which _rows takes them apart: the input, its runs, and a block for each estimate.
+_SELECTED = (
+    *(input_sum.c[name] for name in (*GROUP_COLUMNS, "runs")),
+    *(
+        input_sum.c[f"{estimate}_{name}"]
+        for estimate in ESTIMATES
+        for name in (*COUNTED, *(f"{quantity}_{part}" for quantity in SUMMED for part in _PARTS))
+    ),
+)
+_TRUE = [GROUP_COLUMNS.index(quantity) for quantity in SUMMED]
 
 
-def summarise(database: Database, grid: GridView, limit: int, offset: int = 0) -> Summary:
+def summarise(database: Database, grid: GridView, limit: int, offset: int = 0) -> dict[str, Any]:
     """Rows by input (all but the seed) and the whole grid, both from one picture of the database.
 
-    ``next`` holds the offset of the next page of rows.
+    The answer is a :class:`service.schemas.Summary` as plain data, keys in the order of the models' fields. A page can
+    hold two hundred thousand numbers: models of them take longer to make than all the rest, only to check what this
+    module has written. ``next`` holds the offset of the next page of rows.
     """
     order = [input_sum.c[name] for name in GROUP_COLUMNS]
-    rows = select(input_sum).where(input_sum.c.grid_id == grid.id).order_by(*order).limit(limit + 1).offset(offset)
+    rows = select(*_SELECTED).where(input_sum.c.grid_id == grid.id).order_by(*order).limit(limit + 1).offset(offset)
     with database.read() as connection:
         found = connection.execute(rows).all()
         whole = connection.execute(select(grid_sum).where(grid_sum.c.grid_id == grid.id)).one_or_none()
-    # As plain data, checked once: a page can hold twenty thousand values, and a model is made faster by the thousand.
-    return Summary.model_validate(
-        {
-            "grid_id": grid.id,
-            "state": grid.state,
-            "n_runs": grid.n_runs,
-            "n_stored": 0 if whole is None else whole.runs,
-            "rows": [_row(tuple(row)) for row in found[:limit]],
-            "overall": {} if whole is None else {name: _overall(whole, name) for name in ESTIMATES},
-            "next": str(offset + limit) if len(found) > limit else None,
-        }
-    )
-
-
-_AT = {column.name: place for place, column in enumerate(input_sum.columns)}
-_PARTS = ("shift", "shift2", "sd", "bias", "bias_runs")
-
-
-def _places(estimate: str, quantity: str) -> tuple[int | None, tuple[int, ...]]:
-    """Where a row has a quantity's input, if it is one, and its sums."""
-    return _AT[quantity] if quantity in _INPUTS else None, tuple(
-        _AT[f"{estimate}_{quantity}_{part}"] for part in _PARTS
-    )
-
-
-_QUANTITIES = {name: {quantity: _places(name, quantity) for quantity in SUMMED} for name in ESTIMATES}
-
-
-def _row(row: tuple[Any, ...]) -> dict[str, Any]:
-    """A :class:`SummaryRow` as plain data."""
-    estimates: dict[str, dict[str, Any] | None] = {}
-    for name, quantities in _QUANTITIES.items():
-        estimate: dict[str, Any] = {part: row[_AT[f"{name}_{part}"]] for part in COUNTED}
-        runs = estimate["runs"]
-        if not runs:
-            estimates[name] = None
-            continue
-        for quantity, (place, sums) in quantities.items():
-            true = None if place is None else row[place]
-            total, squares, sd, bias, bias_runs = (row[at] for at in sums)
-            shift = total / runs
-            estimate[quantity] = {
-                "input": true,
-                "mean": shift if true is None else true + shift,
-                "sd": sd / runs,
-                "scatter": _scatter(shift, squares / runs, runs),
-                "bias": bias / bias_runs if bias_runs else None,
-            }
-        estimates[name] = estimate
     return {
-        "input": {name: row[_AT[name]] for name in GROUP_COLUMNS},
-        "n_runs": row[_AT["runs"]],
-        "estimates": estimates,
+        "grid_id": grid.id,
+        "state": grid.state,
+        "n_runs": grid.n_runs,
+        "n_stored": 0 if whole is None else whole.runs,
+        "rows": _rows(found[:limit]) if found else [],
+        "overall": {} if whole is None else {name: _overall(whole, name) for name in ESTIMATES},
+        "next": str(offset + limit) if len(found) > limit else None,
     }
 
 
-def _overall(row: Row[*tuple[Any, ...]], estimate: str) -> OverallEstimate | None:
+def _rows(found: Sequence[Row[Any]]) -> list[dict[str, Any]]:
+    """Each a :class:`service.schemas.SummaryRow` as plain data."""
+    first = len(GROUP_COLUMNS) + 1
+    inputs = [row[:first] for row in found]
+    blocks = np.array([row[first:] for row in found]).reshape(len(found), len(ESTIMATES), -1)
+    columns = [
+        _estimates(blocks[:, place, : len(COUNTED)], blocks[:, place, len(COUNTED) :], inputs)
+        for place in range(len(ESTIMATES))
+    ]
+    return [
+        {
+            "input": dict(zip(GROUP_COLUMNS, place, strict=False)),
+            "n_runs": place[-1],
+            "estimates": dict(zip(ESTIMATES, estimates, strict=True)),
+        }
+        for place, estimates in zip(inputs, zip(*columns, strict=True), strict=True)
+    ]
+
+
+def _estimates(
+    counted: NDArray[np.float64], sums: NDArray[np.float64], inputs: Sequence[Sequence[Any]]
+) -> list[dict[str, Any] | None]:
+    """One estimate of each row: a :class:`service.schemas.SummaryEstimate` as plain data, None where no run has it."""
+    runs = counted[:, 0]
+    quantities = []
+    for number, place in enumerate(_TRUE):
+        total, squares, sd, bias, bias_runs = sums[:, number * len(_PARTS) : (number + 1) * len(_PARTS)].T
+        true = [row[place] for row in inputs]
+        # What was divided by nothing is not taken over.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            shift = total / runs
+            spread = np.sqrt(np.maximum(squares / runs - shift * shift, 0.0) * runs / (runs - 1.0))
+            columns = (
+                true,
+                (true + shift).tolist(),
+                (sd / runs).tolist(),
+                _or_none(spread, runs >= 2),
+                _or_none(bias / bias_runs, bias_runs > 0),
+            )
+        quantities.append(
+            [
+                {"input": true, "mean": mean, "sd": sd, "scatter": scatter, "bias": bias}
+                for true, mean, sd, scatter, bias in zip(*columns, strict=True)
+            ]
+        )
+    # The names of SUMMED and COUNTED in their order, written out because it is a quarter faster.
+    return [
+        {"magnitude": magnitude, "r_eff": r_eff, "n": n, "runs": answered, "at_bound": at_bound, "failed": failed}
+        if answered
+        else None
+        for magnitude, r_eff, n, (answered, at_bound, failed) in zip(
+            *quantities, counted.astype(np.int64).tolist(), strict=True
+        )
+    ]
+
+
+def _or_none(values: NDArray[np.float64], known: NDArray[np.bool_]) -> list[float | None]:
+    """Values as a list, with None for those that are not known."""
+    found: list[float | None] = values.tolist()
+    if known.all():
+        return found
+    return [value if there else None for value, there in zip(found, known.tolist(), strict=True)]
+
+
+def _overall(row: Row[*tuple[Any, ...]], estimate: str) -> dict[str, Any] | None:
+    """One estimator over a grid: a :class:`service.schemas.OverallEstimate` as plain data."""
     column = row._mapping
     runs = column[f"{estimate}_runs"]
     if not runs:
         return None
-    values = {}
+    values: dict[str, Any] = {}
     for quantity in SUMMED:
         name = f"{estimate}_{quantity}"
         bias, square = (_mean(column, f"{name}_{part}", f"{name}_bias_runs") for part in ("bias", "bias2"))
         spread = None if bias is None or square is None else _scatter(bias, square, column[f"{name}_bias_runs"])
-        values[quantity] = OverallValue(bias=bias, bias_scatter=spread, sd=column[f"{name}_sd"] / runs)
-    return OverallEstimate(runs=runs, **values)
+        values[quantity] = {"bias": bias, "bias_scatter": spread, "sd": column[f"{name}_sd"] / runs}
+    return {**values, "runs": runs}
 
 
 def _mean(column: RowMapping, total: str, runs: str) -> float | None:

@@ -12,7 +12,9 @@ from typer.testing import CliRunner
 from service.cli import app
 from service.drills.command import DRILLS
 from service.drills.drill import Ground, OccupiedError, ground
+from service.drills.kills import SchedulerKills, WorkerKills
 from service.drills.outages import DiskFull, PostgresKills, SqliteLock
+from service.drills.remote import TwoWorkers
 from service.drills.report import Report, quantile
 from service.drills.requests import Cancel, Idempotency
 from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
@@ -42,6 +44,8 @@ def _is_at(process: psutil.Process, folder: Path) -> bool:
 @pytest.mark.parametrize(
     "drill",
     [
+        WorkerKills(runs=24, every_s=1.0, workers=2),
+        SchedulerKills(runs=10, kills=1),
         pytest.param(PostgresKills(runs=40, every_s=1.5), marks=pytest.mark.postgres),
         SqliteLock(runs=8, lock_s=2.0),
         DiskFull(runs=8, full_s=1.5),
@@ -70,6 +74,18 @@ def test_drills_of_scale_measure_what_they_say(tmp_path: Path) -> None:
     listing = Listing(large=480, copies=2, papers=1, requests=2).run(Ground(tmp_path / "listing"))
     assert listing.value("stored results") == 2 * 480 * 2 + 384 + 240 // 2
     assert "6 runs done, each stored once" not in unmet(Overhead(runs=6, sleep_s=0.2).run(Ground(tmp_path / "over")))
+    assert nobody_left(tmp_path)
+
+
+def test_two_workers_apart_lose_nothing_and_are_measured_against_one(tmp_path: Path) -> None:
+    """How much the second one adds depends on who else is at the machine, so only that it was measured."""
+    report = TwoWorkers(runs=4, cpu_s=0.1).run(Ground(tmp_path))
+    assert set(unmet(report)) <= {"at least 1.9 times the throughput"}
+    alone, together, ratio = (float(report.value(name)) for name in ("one worker", "two workers", "ratio"))
+    # Four runs of 0.1 s of CPU cannot take less.
+    assert alone >= 0.4
+    assert together >= 0.2
+    assert ratio == alone / together
     assert nobody_left(tmp_path)
 
 

@@ -13,6 +13,7 @@ from sqlalchemy import Connection, inspect
 from typer.testing import CliRunner
 
 from service.cli import app
+from service.schemas import Summary
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
@@ -130,7 +131,7 @@ def _assert_readable(database: Database, lived: history.Rows) -> None:
             detail = grids.run(run.id)
             stored += detail.result is not None
             assert (detail.result is not None) == (detail.state == "done")
-        assert summarise(database, grid, 100).n_runs == grid.n_runs
+        assert Summary.model_validate(summarise(database, grid, 100)).n_runs == grid.n_runs
     assert stored == len(lived["result"]) == 3
 
 

@@ -11,6 +11,7 @@ from sqlalchemy import func, select
 
 from service.payload import ESTIMATES
 from service.requests import GridRequest, plan
+from service.schemas import Summary
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
@@ -70,7 +71,7 @@ OLD = ("paper_free", "paper_fixed", "projected_free", "projected_fixed")
 
 
 def check(database: Database, grid_id: str, estimates: Sequence[str] = ESTIMATES) -> None:
-    summary = summarise(database, GridStore(database).grid(grid_id), 1000)
+    summary = Summary.model_validate(summarise(database, GridStore(database).grid(grid_id), 1000))
     assert summary.n_stored == summary.n_runs == 3 * len(summary.rows)
     for estimate in estimates:
         for quantity in SUMMED:
@@ -103,7 +104,7 @@ def test_a_migration_adds_up_what_was_stored_before(database: Database, url: str
     downgrade(url, "0002")
     upgrade(url)
     check(database, grid_id, OLD)
-    summary = summarise(database, GridStore(database).grid(grid_id), 1000)
+    summary = Summary.model_validate(summarise(database, GridStore(database).grid(grid_id), 1000))
     for row in summary.rows:
         assert {name for name, found in row.estimates.items() if found is not None} == set(OLD)
     assert {name for name, found in summary.overall.items() if found is not None} == set(OLD)
@@ -129,7 +130,7 @@ def test_a_run_without_an_answer_is_not_in_the_means(database: Database) -> None
             assert found is not None
             expected.append(found.magnitude.mean)
         queue.store(lease, payload.model_copy(update={"estimates": changed}))
-    summary = summarise(database, GridStore(database).grid(grid_id), 1000)
+    summary = Summary.model_validate(summarise(database, GridStore(database).grid(grid_id), 1000))
     (row,) = summary.rows
     answered = row.estimates["paper_free"]
     assert row.estimates["image_wide"] is None
