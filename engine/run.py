@@ -33,8 +33,9 @@ from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Target, wide_prior
 from engine.refits.draws import DrawSet, source_draw
-from engine.refits.estimators import Refit, refit_draws
+from engine.refits.estimators import refit_draws
 from engine.refits.profiles import profile_on_grid
+from engine.refits.sersic_fit import Refit
 from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import (
     ESTIMATORS,
@@ -240,7 +241,10 @@ def measure(
     watch = watch or _Stopwatch(None)
     with watch.stage("parametric"):
         if fit is None:
-            fit = fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
+            fit = fit_parametric(
+                observation, agn_images=agn_images, deflector=deflector, shear=shear, priors=analysis.priors,
+                fixed_index=fixed_index,
+            )  # fmt: skip
     with watch.stage("prepare"):
         problem = prepare_problem(observation, fit, analysis)
     with watch.stage("optimum"):
@@ -264,7 +268,7 @@ def measure(
         best = target.invert(chain.flat()[int(np.argmax(flat_ln))])
         products, chi2 = products_of(observation, problem, best, chain.flat(), target.prior.names, truth)
     with watch.stage("refit"):
-        drawn = DrawSet(problem.operator, tuple(draws))
+        drawn = DrawSet(tuple(draws), fit.hosts)
         refits, estimates, aperture, warnings = _refit(drawn, observation.zero_point, truth, fixed_index, rng)
     if chain.summary.status != "converged":
         warnings.append(

@@ -58,21 +58,6 @@ class PixelCoupling:
     row_patch: IndexArray
     blocks: FloatArray
 
-    def apply(self, images: FloatArray) -> FloatArray:
-        """W times images (P, any number), pixels as in B."""
-        patches, count = self.start.size - 1, images.shape[1]
-        placed = np.zeros((patches, TILE, count))
-        placed.reshape(-1, count)[: self.order.size] = images[self.order]
-        out = np.zeros_like(placed)
-        for patch in range(patches):
-            some = slice(self.start[patch], self.start[patch + 1])
-            rows, column = self.row_patch[some], self.blocks[some].reshape(-1, TILE)
-            out[rows] += (column @ placed[patch]).reshape(rows.size, TILE, count)
-            out[patch] += column.T @ placed[rows].reshape(-1, count)
-        result = np.empty_like(images)
-        result[self.order] = out.reshape(-1, count)[: self.order.size]
-        return result
-
     def dense(self) -> FloatArray:
         """W (P, P), pixels as in B."""
         p = self.order.size

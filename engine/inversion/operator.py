@@ -99,10 +99,6 @@ class Operator:
     blurring: sparse.csr_matrix
     whitened: WhitenedData
 
-    def couple(self, images: FloatArray) -> FloatArray:
-        """B^T P B times images (P, any number)."""
-        return np.asarray(self.coupling.apply(images) - self.border @ (self.border.T @ images))
-
     def fit_amplitudes(self, arc: FloatArray) -> FloatArray:
         """Best amplitudes (k,) for a given model of the lensed host on the mask (M,)."""
         rest = self.whitened.data - self.whitened.noise.whiten(arc)

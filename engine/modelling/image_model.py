@@ -8,9 +8,10 @@ interpolated at every ray by the same spline as at every AGN image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from types import MappingProxyType
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens, source_position
 from engine.light.rendering import render_sersic, sample_sersic
 from engine.light.sersic import SersicProfile
+from engine.spec import LensParameterName, ParameterPrior
 
 RENDER_TOLERANCE = 1e-3
 POSITION_ERROR = 0.01
@@ -32,6 +34,10 @@ SHEAR_PRIOR = 0.15
 ELLIPTICITY_PRIOR = 0.25
 CENTRE_PRIOR = 0.1
 """Offset [arcsec] of the lens from the deflector's light, or from the frame where it has none."""
+OWN_PARAMETER: dict[LensParameterName, int] = {"theta_E": 0, "slope": 3, "x": 4, "y": 5, "gamma1": 6, "gamma2": 7}
+"""Lens parameters that are parameters of the fit as well, with their places; q and phi are there as ellipticities."""
+_BOUND_ERROR = 1e-3
+"""How far q or phi may stray beyond a bound that is asked for, which is no bound of an ellipticity."""
 _STEPS = {"deflector": (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4), "host": (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4)}
 _LENS_STEP = 1e-5
 _ANCHOR = 5e-4
@@ -126,6 +132,8 @@ class ImageModel:
     exact : bool
         Sersic light integrated over the sub-pixels to :data:`RENDER_TOLERANCE`, and AGN through the exposures where
         these are known; without it the rays are samples and the AGN are shifted stamps: for quick first fits.
+    priors : mapping, optional
+        What is known of lens parameters, by name; each replaces the prior that holds otherwise.
     """
 
     def __init__(
@@ -137,9 +145,10 @@ class ImageModel:
         *,
         subrays: int,
         exact: bool,
+        priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
     ) -> None:
         self.observation, self.layout, self.window = observation, layout, window
-        self.subrays, self.exact = subrays, exact
+        self.subrays, self.exact, self.priors = subrays, exact, priors
         ny, nx = observation.shape
         scale = observation.pixel_scale
         x, y = pixel_centres(nx, scale)[window[1]], pixel_centres(ny, scale)[window[0]]
@@ -242,8 +251,9 @@ class ImageModel:
         layout = self.layout
         lens, host = values[layout.lens_slice], values[layout.host_slice]
         out: list[FloatArray] = [
+            np.array(_misfits(lens_of(lens), layout.lens_names, self.priors)),
             (lens[1:3]) / ELLIPTICITY_PRIOR,
-            (lens[3:4] - SLOPE_PRIOR[0]) / SLOPE_PRIOR[1],
+            (lens[3:4] - SLOPE_PRIOR[0]) / (SLOPE_PRIOR[1] if _free("slope", self.priors) else math.inf),
             (lens[4:6] - (values[layout.deflector_slice][4:6] if layout.deflector else 0.0)) / CENTRE_PRIOR,
             lens[6:8] / SHEAR_PRIOR,
         ]
@@ -306,6 +316,30 @@ class ImageModel:
             shifted[k] += step
             out[:, k] = (render(shifted) - here) / step
         return out
+
+
+def _free(name: LensParameterName, priors: Mapping[LensParameterName, ParameterPrior]) -> bool:
+    """Whether nothing but bounds is known of a parameter."""
+    return name not in priors or priors[name].mean is None
+
+
+def _misfits(
+    lens: PowerLawLens, names: Sequence[str], priors: Mapping[LensParameterName, ParameterPrior]
+) -> list[float]:
+    """Departures of a lens from its priors in their deviations, of q and phi from bounds in :data:`_BOUND_ERROR`."""
+    out: list[float] = []
+    for name, prior in priors.items():
+        if name not in names:
+            continue
+        value = float(getattr(lens, name))
+        for bound, side in ((prior.low, -1.0), (prior.high, 1.0)):
+            if bound is not None and name not in OWN_PARAMETER:
+                beyond = math.remainder(value - bound, math.pi) if name == "phi" else value - bound
+                out.append(max(side * beyond, 0.0) / _BOUND_ERROR)
+        if prior.mean is not None and prior.sd is not None:
+            away = value - prior.mean
+            out.append((math.remainder(away, math.pi) if name == "phi" else away) / prior.sd)
+    return out
 
 
 def _differences(function: Callable[[FloatArray], FloatArray], values: FloatArray, step: float) -> FloatArray:

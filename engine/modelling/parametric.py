@@ -7,8 +7,9 @@ fits from several deterministic starts on a window of the image come first; the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ from engine.errors import ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
+from engine.modelling.host_posterior import HostPosterior
 from engine.modelling.image_model import (
+    OWN_PARAMETER,
     POSITION_ERROR,
     ImageModel,
     Layout,
@@ -40,6 +43,8 @@ from engine.modelling.starts import (
     starts_from_agn,
     starts_from_arc,
 )
+from engine.result import INDEX_RANGES, IndexPrior
+from engine.spec import LensParameterName, ParameterPrior
 
 _QUICK_SUBRAYS, _SUBRAYS = 1, 2
 _QUICK_WINDOW = 1.6
@@ -61,6 +66,8 @@ _MOST_CANDIDATES = 6
 _AGN_NUMBERS = (4, 3, 2, 0)
 _ARC_STARTS = 4
 _BORDER = 3
+_LEAST_ROOM = 1e-5
+"""Between two bounds: least squares want some."""
 _RADII, _LEAST_RADIUS = 3.0, 2.5
 """The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
 _FEWEST_RADII = 2.2
@@ -87,8 +94,9 @@ class ParametricFit:
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
     that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
     chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
-    their noise and the error of the PSF, infinite where a pixel was not fitted. ``model`` and ``arc`` are images
-    (ny, nx) of everything and of the lensed host [e-/s].
+    their noise and the error of the PSF, infinite where a pixel was not fitted. ``hosts`` are the posteriors of the
+    host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
+    everything and of the lensed host [e-/s].
     """
 
     lens: PowerLawLens
@@ -99,6 +107,7 @@ class ParametricFit:
     lens_names: tuple[str, ...]
     lens_covariance: FloatArray
     host_covariance: FloatArray
+    hosts: Mapping[IndexPrior, HostPosterior]
     chi2: float
     degrees_of_freedom: int
     evaluations: int
@@ -130,8 +139,9 @@ def _start_vector(layout: Layout, start: Start, centre: tuple[float, float]) -> 
     return np.array(values)
 
 
-def _bounds(layout: Layout, start: FloatArray, pixel_scale: float) -> tuple[FloatArray, FloatArray]:
-    e = _MAX_ELLIPTICITY
+def _bounds(model: ImageModel, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest parameters of a fit from ``start``, those of the priors included that have a parameter."""
+    layout, pixel_scale, e = model.layout, model.observation.pixel_scale, _MAX_ELLIPTICITY
     x, y = start[layout.lens_slice][4:6].tolist()
     theta_E = float(start[layout.lens_slice][0])
     near = [(x - 0.4, x + 0.4), (y - 0.4, y + 0.4)]
@@ -140,20 +150,47 @@ def _bounds(layout: Layout, start: FloatArray, pixel_scale: float) -> tuple[Floa
         half += [(math.log(0.03), math.log(20.0)), (0.5, 9.0), (-e, e), (-e, e), *near]
     half += [(0.4 * theta_E, 1.8 * theta_E), (-e, e), (-e, e), (1.3, 2.7), *near]
     half += [(-0.4, 0.4), (-0.4, 0.4)] if layout.shear else []
-    half += [(math.log(0.02), math.log(5.0)), (0.4, 8.5), (-e, e), (-e, e)]
+    half += [(math.log(0.02), math.log(5.0)), INDEX_RANGES["wide"], (-e, e), (-e, e)]
     half += [(x - theta_E, x + theta_E), (y - theta_E, y + theta_E)]
     low, high = np.array(half).T
+    first = layout.lens_slice.start
+    for name, prior in model.priors.items():
+        if name in OWN_PARAMETER and first + OWN_PARAMETER[name] < layout.lens_slice.stop:
+            k = first + OWN_PARAMETER[name]
+            low[k] = low[k] if prior.low is None else min(max(low[k], prior.low), high[k] - _LEAST_ROOM)
+            high[k] = high[k] if prior.high is None else max(min(high[k], prior.high), low[k] + _LEAST_ROOM)
     return low, high
 
 
 def _minimise(model: ImageModel, start: Start, values: FloatArray, steps: int, tolerance: float) -> _Solution:
-    low, high = _bounds(model.layout, values, model.observation.pixel_scale)
+    low, high = _bounds(model, values)
     inside = np.clip(values, low + 1e-6, high - 1e-6)
     fit = least_squares(
         model.residuals, inside, model.jacobian, (low, high), x_scale="jac", xtol=tolerance, ftol=tolerance,
         max_nfev=steps,
     )  # fmt: skip
     return _Solution(model, fit.x, 2.0 * float(fit.cost), int(fit.nfev), start)
+
+
+def _minimise_held(solution: _Solution, values: FloatArray, at: int, held: float) -> _Solution:
+    """The minimum with parameter ``at`` held, from other values of the rest."""
+    model = solution.model
+    low, high = (np.delete(side, at) for side in _bounds(model, solution.values))
+
+    def whole(free: FloatArray) -> FloatArray:
+        return np.insert(free, at, held)
+
+    fit = least_squares(
+        lambda free: model.residuals(whole(free)),
+        np.clip(np.delete(values, at), low + 1e-6, high - 1e-6),
+        lambda free: np.delete(model.jacobian(whole(free)), at, axis=1),
+        (low, high),
+        x_scale="jac",
+        xtol=1e-4,
+        ftol=1e-5,
+        max_nfev=_STEPS,
+    )
+    return _Solution(model, whole(fit.x), 2.0 * float(fit.cost), int(fit.nfev), solution.start)
 
 
 def _stamp_radius(psf: FloatArray) -> int:
@@ -193,6 +230,8 @@ def fit_parametric(
     theta_E: float | None = None,
     positions: Sequence[tuple[float, float]] | None = None,
     acceptance: Acceptance = GOOD_START,
+    priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
+    fixed_index: float | None = None,
 ) -> ParametricFit:
     """Find lens, AGN images and host, from nothing but the observation.
 
@@ -211,6 +250,10 @@ def fit_parametric(
         Rough positions of the AGN images [arcsec, image frame]; then ``agn_images`` is their number.
     acceptance : Acceptance
         How bad a fit may be that is handed on.
+    priors : mapping, optional
+        What is known of lens parameters, by name, instead of the wide priors that hold otherwise.
+    fixed_index : float, optional
+        An index at which the host's n is held for one more of its posteriors.
 
     Raises
     ------
@@ -219,7 +262,7 @@ def fit_parametric(
     PosteriorError
         No start leads to an acceptable fit; the message says what is wrong with the best.
     """
-    finder = _Finder(observation, deflector=deflector, acceptance=acceptance)
+    finder = _Finder(observation, deflector=deflector, acceptance=acceptance, priors=priors)
     radius = min(observation.shape) * observation.pixel_scale / 2
     _refuse(
         {
@@ -232,7 +275,7 @@ def fit_parametric(
     for wave in (groups, [_varied(group) for group in groups]):
         for solution in finder.ranked([finder.quick(group) for group in wave], shear=shear is not False):
             try:
-                return finder.result(finder.polish(solution, shear=shear))
+                return finder.result(finder.polish(solution, shear=shear), fixed_index)
             except PosteriorError as error:
                 refusals.append(str(error))
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
@@ -257,8 +300,16 @@ def _varied(group: list[Start]) -> list[Start]:
 class _Finder:
     """The stages of the search for one observation."""
 
-    def __init__(self, observation: Observation, *, deflector: bool, acceptance: Acceptance) -> None:
+    def __init__(
+        self,
+        observation: Observation,
+        *,
+        deflector: bool,
+        acceptance: Acceptance,
+        priors: Mapping[LensParameterName, ParameterPrior],
+    ) -> None:
         self.observation, self.has_deflector, self.acceptance = observation, deflector, acceptance
+        self.priors = priors
         self.image = filled_image(observation)
         self.noise = np.where(
             observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
@@ -386,7 +437,10 @@ class _Finder:
 
     def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
         ny, nx = self.observation.shape
-        return ImageModel(self.observation, layout, sigma, (slice(0, ny), slice(0, nx)), subrays=_SUBRAYS, exact=True)
+        whole = slice(0, ny), slice(0, nx)
+        return ImageModel(
+            self.observation, layout, sigma, whole, subrays=_SUBRAYS, exact=True, priors=self.priors
+        )  # fmt: skip
 
     def polish(self, quick: _Solution, *, shear: bool | None) -> _Solution:
         """The fit of the whole image from a quick one; with shear where it is wanted, or is worth its parameters."""
@@ -434,7 +488,40 @@ class _Finder:
             out += weighted.T @ (shared @ weighted)
         return 0.5 * (out + out.T)
 
-    def result(self, solution: _Solution) -> ParametricFit:
+    def _hosts(
+        self, solution: _Solution, covariance: FloatArray, inflation: float, fixed_index: float | None
+    ) -> dict[IndexPrior, HostPosterior]:
+        """The host with each prior of n, from a solution with the widest and its covariance.
+
+        A maximum inside a narrower range is that range's too. One outside ends at its bound: everything else is fitted
+        again with n held there.
+        """
+        values, at_n = solution.values, solution.model.layout.host_slice.start + 1
+        ranges = INDEX_RANGES if fixed_index is None else {**INDEX_RANGES, "fixed": (fixed_index, fixed_index)}
+        wide = _host_posterior(solution, covariance, held=None)
+        out: dict[IndexPrior, HostPosterior] = {"wide": wide}
+        for prior, (low, high) in ranges.items():
+            if prior == "wide":
+                continue
+            if low < values[at_n] < high:
+                out[prior] = wide.inside(low, high)
+                continue
+            held = float(np.clip(values[at_n], low, high))
+            shift = covariance[: values.size, at_n] / covariance[at_n, at_n] * (held - values[at_n])
+            found = _minimise_held(solution, values + shift, at_n, held)
+            self.evaluations += found.evaluations
+            jacobian, amplitudes = found.model.full_jacobian(found.values)
+            if not amplitudes[-2] > 0:
+                continue
+            free = np.delete(np.arange(jacobian.shape[1]), at_n)
+            shared = self._shared(found.model, jacobian[: found.model.data.size])
+            held_covariance = np.zeros((jacobian.shape[1],) * 2)
+            held_covariance[np.ix_(free, free)] = inflation * _covariance(jacobian[:, free], shared[np.ix_(free, free)])
+            posterior = _host_posterior(found, held_covariance, held=held)
+            out[prior] = replace(posterior, n_at_bound=low < high)
+        return out
+
+    def result(self, solution: _Solution, fixed_index: float | None = None) -> ParametricFit:
         """The fit as it is handed on; a PosteriorError where it is no good."""
         model, values, layout = solution.model, solution.values, solution.model.layout
         jacobian, amplitudes = model.full_jacobian(values)
@@ -472,6 +559,7 @@ class _Finder:
             lens_names=layout.lens_names,
             lens_covariance=_lens_block(layout, covariance, values),
             host_covariance=_host_block(layout, covariance, values),
+            hosts=self._hosts(solution, covariance, inflation, fixed_index),
             chi2=chi2,
             degrees_of_freedom=freedom,
             evaluations=self.evaluations,
@@ -535,10 +623,31 @@ def _host_block(layout: Layout, covariance: FloatArray, values: FloatArray) -> F
     return np.asarray(chain @ covariance[np.ix_(chosen, chosen)] @ chain.T)
 
 
+def _host_posterior(solution: _Solution, covariance: FloatArray, held: float | None) -> HostPosterior:
+    """The host's block of a covariance of all parameters and amplitudes, its flux in the logarithm."""
+    layout, values = solution.model.layout, solution.values
+    where = layout.host_slice
+    flux = float(solution.model.amplitudes(values)[0][-2])
+    chosen = [layout.size + layout.amplitudes - 2, *range(where.start, where.stop)]
+    scale = np.array([1.0 / flux, *np.ones(6)])
+    low, high = (side[where] for side in _bounds(solution.model, values))
+    if held is not None:
+        low[1] = high[1] = held
+    ended = _at_bound(solution)
+    return HostPosterior(
+        mean=np.array([math.log(flux), *values[where]]),
+        covariance=covariance[np.ix_(chosen, chosen)] * np.outer(scale, scale),
+        low=np.array([-math.inf, *low]),
+        high=np.array([math.inf, *high]),
+        n_at_bound="host.n" in ended,
+        r_eff_at_bound="host.ln r_eff" in ended,
+    )
+
+
 def _at_bound(solution: _Solution) -> tuple[str, ...]:
     """Names of the parameters of host, lens and deflector that ended at a bound."""
     layout, values = solution.model.layout, solution.values
-    low, high = _bounds(layout, values, solution.model.observation.pixel_scale)
+    low, high = _bounds(solution.model, values)
     names = [f"agn{k // 2 + 1}.{'xy'[k % 2]}" for k in range(2 * layout.n_agn)]
     light = ("ln r_eff", "n", "e1", "e2", "x", "y")
     names += [f"deflector.{name}" for name in light] if layout.deflector else []

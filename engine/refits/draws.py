@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +14,10 @@ import numpy as np
 from engine.conventions import FloatArray
 from engine.inversion.evidence import Inversion
 from engine.inversion.mapping import SourceGrid
-from engine.inversion.operator import Operator
 from engine.lensing.power_law import PowerLawLens
+from engine.modelling.host_posterior import HostPosterior
 from engine.refits.profiles import MAX_ELLIPTICITY
+from engine.result import IndexPrior
 
 _SMALLEST_RADIUS = 0.1
 """Bound of r_eff in units of the smallest node spacing."""
@@ -63,10 +65,10 @@ class SourceDraw:
 
 @dataclass(frozen=True)
 class DrawSet:
-    """Draws of one chain (one at least), and the operator that their inversions share."""
+    """Draws of one chain (one at least), and the host with each prior of n as the fit of the whole image has it."""
 
-    operator: Operator
     draws: tuple[SourceDraw, ...]
+    hosts: Mapping[IndexPrior, HostPosterior]
 
 
 def source_draw(inversion: Inversion, lens: PowerLawLens, rng: np.random.Generator) -> SourceDraw:

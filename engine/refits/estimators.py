@@ -1,8 +1,9 @@
 """All estimators on all draws of one chain.
 
-The fits of an estimator start from one reference fit, that of the first draw, and from the centres that the estimator
-before found for each draw: the mean source is fitted first, from its moments. The widest range of n is fitted first;
-where a draw's fit lies within a narrower range, it is that range's fit too.
+``image`` knows the host from the whole image. The others fit the source of each draw: their fits start from one
+reference fit, that of the first draw, and from the centres that the estimator before found for each draw: the mean
+source is fitted first, from its moments. The widest range of n is fitted first; where a draw's fit lies within a
+narrower range, it is that range's fit too.
 """
 
 from __future__ import annotations
@@ -15,40 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
-from engine.light.sersic import SersicProfile
 from engine.refits.covariance import CovarianceMetric
 from engine.refits.draws import DrawSet, SourceDraw
-from engine.refits.image import ImageMetric
+from engine.refits.image import refit_image
 from engine.refits.least_squares import Fits, Metric, fit_shapes, scatter
 from engine.refits.paper import PaperMetric
 from engine.refits.profiles import LN_R_EFF, N, X, Y, profile_of
 from engine.refits.projected import ProjectedMetric
+from engine.refits.sersic_fit import Refit, SersicFit
 from engine.result import INDEX_RANGES, EstimatorName, IndexPrior
 
 _BOUND_MARGIN = 1e-3
-_FAR = 25.0
-"""Half the chi^2 above the other draws from which a fit is taken to be stuck: draws of one posterior differ by 10."""
 _START_INDICES = (0.8, 2.0, 4.0)
-_DATA_ESTIMATORS: tuple[EstimatorName, ...] = ("projected", "image")
-"""Their chi^2 is that of the data: the source's own scatter is not in the draws that they see, it is added."""
-
-
-@dataclass(frozen=True)
-class SersicFit:
-    """One fit: the profile, and which of n and r_eff ended at a bound."""
-
-    profile: SersicProfile
-    n_at_bound: bool
-    r_eff_at_bound: bool
-
-
-@dataclass(frozen=True)
-class Refit:
-    """One estimator with one prior of n: a fit for each draw, None where there is none."""
-
-    estimator: EstimatorName
-    index_prior: IndexPrior
-    fits: tuple[SersicFit | None, ...]
 
 
 def _moments(draw: SourceDraw) -> FloatArray:
@@ -95,24 +74,23 @@ def _first_start(draw: SourceDraw, bounds: _Bounds) -> FloatArray:
     return np.asarray(fits.shapes[int(np.argmax(np.where(fits.fluxes > 0, gain, -np.inf)))])
 
 
-def _metric(estimator: EstimatorName, drawn: DrawSet) -> Metric:
+def _metric(estimator: EstimatorName, draws: Sequence[SourceDraw]) -> Metric:
     match estimator:
         case "paper":
-            return PaperMetric(drawn.draws, [draw.drawn for draw in drawn.draws])
+            return PaperMetric(draws, [draw.drawn for draw in draws])
         case "covariance":
-            return CovarianceMetric(drawn.draws)
+            return CovarianceMetric(draws)
         case "projected":
-            return ProjectedMetric(drawn.draws)
-        case "image":
-            return ImageMetric(drawn.operator, drawn.draws)
+            return ProjectedMetric(draws)
+        case _:
+            raise ValueError(f"estimator: got {estimator!r}, allowed are those that fit a drawn source")
 
 
-def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None, *, of_data: bool) -> Fits:
+def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None) -> Fits:
     """Fit the first draw from its start, and all draws from there, each with the centre of its own start (K, 6).
 
     The lens moves the source between the draws: against a peaked profile elsewhere the fit would rather blunt it than
-    move it. A fit that does not end, or ends far above the others where their chi^2 is that of the same data, is tried
-    alone. With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that
+    move it. With ``wider``, fits with a wider prior of n, only draws whose fit lies outside are fitted again, from that
     fit.
     """
     if wider is not None:
@@ -125,16 +103,7 @@ def _fit(metric: Metric, starts: FloatArray, bounds: _Bounds, wider: Fits | None
     reference = fit_shapes(metric, every[:1], starts[:1], bounds.low[:1], bounds.high[:1]).shapes[0]
     moved = np.repeat(reference[None], every.size, axis=0)
     moved[:, (X, Y)] += starts[:, (X, Y)] - starts[0, (X, Y)]
-    fits = fit_shapes(metric, every, moved, bounds.low, bounds.high)
-    lost = ~fits.converged
-    if of_data:
-        lost |= fits.value > np.median(fits.value) + _FAR
-    for k in np.flatnonzero(lost):
-        # With its own curvature, which a metric may have shared until now.
-        again = fit_shapes(metric, every[k : k + 1], moved[k : k + 1], bounds.low[k : k + 1], bounds.high[k : k + 1])
-        if again.value[0] < fits.value[k]:
-            fits = fits.replaced(every[k : k + 1], again)
-    return fits
+    return fit_shapes(metric, every, moved, bounds.low, bounds.high)
 
 
 def _flagged(fits: Fits, shapes: FloatArray, fluxes: FloatArray, bounds: _Bounds) -> tuple[SersicFit | None, ...]:
@@ -157,7 +126,7 @@ def refit_draws(
     fixed_index: float | None,
     rng: np.random.Generator,
 ) -> list[Refit]:
-    """Fit every draw by every estimator, with n free, n in a wide range, and n held at ``fixed_index`` if there is one.
+    """Refit by every estimator, with n free, n in a wide range, and n held at ``fixed_index`` if there is one.
 
     A fit that does not converge, or whose flux is not positive, is None.
     """
@@ -167,26 +136,43 @@ def refit_draws(
     bounds = {prior: _Bounds.of(drawn.draws, index_range) for prior, index_range in ranges.items()}
     starts = np.repeat(_first_start(drawn.draws[0], bounds["wide"])[None], len(drawn.draws), axis=0)
     seeds = [int(seed) for seed in rng.integers(2**63, size=len(drawn.draws))]
-    every = np.arange(len(drawn.draws))
     out = []
     for estimator in estimators:
-        metric, added = _metric(estimator, drawn), estimator in _DATA_ESTIMATORS
-        wide: Fits | None = None
-        spread: tuple[FloatArray, FloatArray] | None = None
-        for prior, inside in bounds.items():
-            fits = _fit(metric, starts, inside, wide if prior == "free" else None, of_data=added)
-            if prior == "wide":
-                wide = fits
-                starts = np.where((fits.fluxes > 0)[:, None], fits.shapes, starts)
-            # The same random numbers for every prior: what differs between them is not chance, and scatter that stays
-            # within a narrower range need not be drawn again.
-            if not (fits is wide and spread is not None and inside.hold(spread[0]).all()):
-                generators = [np.random.default_rng(seed) for seed in seeds]
-                spread = (
-                    scatter(metric, every, fits, inside.low, inside.high, generators)
-                    if added
-                    else (fits.shapes, fits.fluxes)
-                )
-            shapes, fluxes = spread
-            out.append(Refit(estimator, prior, _flagged(fits, shapes, fluxes, inside)))
+        if estimator == "image":
+            out += refit_image(drawn.hosts, tuple(bounds), len(seeds), seeds[0])
+            continue
+        found, wide = _refit_sources(estimator, drawn.draws, starts, bounds, seeds)
+        starts = np.where((wide.fluxes > 0)[:, None], wide.shapes, starts)
+        out += found
     return out
+
+
+def _refit_sources(
+    estimator: EstimatorName,
+    draws: Sequence[SourceDraw],
+    starts: FloatArray,
+    bounds: dict[IndexPrior, _Bounds],
+    seeds: Sequence[int],
+) -> tuple[list[Refit], Fits]:
+    """An estimator that fits each drawn source, with every prior of n, the widest first; and its fits with that."""
+    metric, every = _metric(estimator, draws), np.arange(len(draws))
+    out: list[Refit] = []
+    first: Fits | None = None
+    spread: tuple[FloatArray, FloatArray] | None = None
+    for prior, inside in bounds.items():
+        fits = _fit(metric, starts, inside, first if prior == "free" else None)
+        if first is None:
+            first = fits
+            starts = np.where((fits.fluxes > 0)[:, None], fits.shapes, starts)
+        # The same random numbers for every prior: what differs between them is not chance, and scatter that stays
+        # within a narrower range need not be drawn again.
+        if not (fits is first and spread is not None and inside.hold(spread[0]).all()):
+            spread = fits.shapes, fits.fluxes
+            if isinstance(metric, ProjectedMetric):
+                # Its chi^2 is that of the data: the source's own scatter is not in the draws that it sees.
+                generators = [np.random.default_rng(seed) for seed in seeds]
+                spread = scatter(metric, every, fits, inside.low, inside.high, generators)
+        out.append(Refit(estimator, prior, _flagged(fits, *spread, inside)))
+    if first is None:
+        raise ValueError("bounds: got none, allowed is one prior of n at least")
+    return out, first

@@ -27,15 +27,13 @@ _ENOUGH = 1e-3
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Products of k draws: C^T W C (k, COLUMNS, COLUMNS), C^T W m and C^T b (k, COLUMNS).
+    """Products of k draws: C^T W C (k, COLUMNS, COLUMNS) and C^T b (k, COLUMNS).
 
-    C holds the derivatives of the unit-flux model by its shape, then the model m itself. ``gram`` steers the steps and
-    may be approximate, ``cross`` and ``right`` say where the minimum is. ``unit`` (k,) is the gain in chi^2 that counts
-    as one standard deviation.
+    C holds the derivatives of the unit-flux model by its shape, then the model m itself. ``unit`` (k,) is the gain in
+    chi^2 that counts as one standard deviation.
     """
 
     gram: FloatArray
-    cross: FloatArray
     right: FloatArray
     unit: FloatArray
 
@@ -90,10 +88,10 @@ def _best_flux(norm: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _profile_out(equations: NormalEquations) -> _Profiled:
-    gram, cross, right = equations.gram, equations.cross, equations.right
-    flux = _best_flux(cross[:, _FLUX], right[:, _FLUX])
-    gradient = flux[:, None] * (flux[:, None] * cross[:, :_FLUX] - right[:, :_FLUX])
+    gram, right = equations.gram, equations.right
+    flux = _best_flux(gram[:, _FLUX, _FLUX], right[:, _FLUX])
     by_flux = gram[:, :_FLUX, _FLUX]
+    gradient = flux[:, None] * (flux[:, None] * by_flux - right[:, :_FLUX])
     norm = gram[:, _FLUX, _FLUX, None, None]
     shadow = by_flux[:, :, None] * by_flux[:, None, :] / np.where(norm > 0, norm, 1.0)
     hessian = (flux**2)[:, None, None] * (gram[:, :_FLUX, :_FLUX] - shadow)
@@ -184,7 +182,7 @@ def scatter(
         ]
     )
     found = metric.normal_equations(which, shapes)
-    norm = found.cross[:, _FLUX]
+    norm = found.gram[:, _FLUX, _FLUX]
     noise = np.array([rng.standard_normal() for rng in generators])
     return shapes, _best_flux(norm, found.right[:, _FLUX] + noise * np.sqrt(np.maximum(norm, 0.0)))
 

@@ -22,5 +22,4 @@ def rest_per_point(gram: FloatArray, right: FloatArray, norm: float, points: int
 def stacked(found: Sequence[tuple[FloatArray, FloatArray, float]]) -> NormalEquations:
     """Normal equations of several draws as one."""
     grams, rights, units = zip(*found, strict=True)
-    gram = np.array(grams)
-    return NormalEquations(gram, gram[:, :, -1], np.array(rights), np.array(units))
+    return NormalEquations(np.array(grams), np.array(rights), np.array(units))

@@ -11,7 +11,7 @@ from engine.conventions import position_angle, rate_to_magnitude
 from engine.light.sersic import SersicProfile, flux_in_circle
 from engine.refits.aperture import RADIUS, aperture_flux
 from engine.refits.draws import SourceDraw
-from engine.refits.estimators import Refit
+from engine.refits.sersic_fit import Refit
 from engine.result import Aperture, Estimate, Quantity
 
 

@@ -47,7 +47,7 @@ def find(simulation: Simulation, fit: ParametricFit, analysis: Analysis, lens: P
     inversion = target.invert(target.vector(lens, optimal_strength(target, lens)))
     rng = np.random.default_rng(0)
     draw = replace(source_draw(inversion, lens, rng), drawn=inversion.source)
-    refits = refit_draws(DrawSet(problem.operator, (draw,)), ("paper",), None, rng)
+    refits = refit_draws(DrawSet((draw,), fit.hosts), ("paper",), None, rng)
     profile = next(refit for refit in refits if refit.index_prior == "free").fits[0]
     assert profile is not None
     arc = problem.operator.blurring @ inversion.mapping.apply(inversion.source.ravel())

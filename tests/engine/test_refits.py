@@ -7,25 +7,19 @@ import numpy as np
 import pytest
 
 from engine.conventions import rate_to_magnitude
-from engine.imaging.blurring import convolve
-from engine.inversion.blurring import pixel_kernel
 from engine.inversion.evidence import invert
-from engine.inversion.mapping import RayBundle, SourceGrid, cast_rays
-from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.inversion.problem import ring_mask
+from engine.inversion.mapping import SourceGrid
 from engine.inversion.regularisation import SourceModel
 from engine.light.sersic import SersicProfile, flux_in_circle, surface_brightness
 from engine.refits.aperture import aperture_flux
 from engine.refits.draws import DrawSet, SourceDraw, source_draw
 from engine.refits.estimators import Refit, SersicFit, refit_draws
-from engine.refits.image import ImageMetric, RayTracedModel
 from engine.refits.least_squares import fit_shapes, scatter
 from engine.refits.profiles import columns_on_grid, profile_of, profile_on_grid, shape_of
 from engine.refits.projected import ProjectedMetric
 from engine.refits.summaries import summarise, summarise_aperture
-from engine.result import ESTIMATORS, EstimatorName
+from engine.result import EstimatorName
 from engine.run import Truth, _refit
-from engine.simulation import Simulation
 from tests.engine.dense_oracle import LENS, Case
 
 GRID = SourceGrid(np.linspace(-0.8, 0.8, 31), np.linspace(-0.7, 0.75, 29))
@@ -47,15 +41,10 @@ def draw_of(source: np.ndarray, grid: SourceGrid = GRID, precision: float = 1.0)
     )
 
 
-@pytest.fixture(scope="module")
-def operator() -> Operator:
-    return Case(amplitudes=1).operator()
-
-
 def refits(
-    draws: list[SourceDraw], operator: Operator, estimators: tuple[EstimatorName, ...] = ON_MAPS, n: float | None = None
+    draws: list[SourceDraw], estimators: tuple[EstimatorName, ...] = ON_MAPS, n: float | None = None
 ) -> dict[tuple[str, str], Refit]:
-    found = refit_draws(DrawSet(operator, tuple(draws)), estimators, n, np.random.default_rng(0))
+    found = refit_draws(DrawSet(tuple(draws), {}), estimators, n, np.random.default_rng(0))
     return {(refit.estimator, refit.index_prior): refit for refit in found}
 
 
@@ -92,9 +81,9 @@ def test_parameters_and_profile_are_one_and_the_same() -> None:
 
 
 @pytest.mark.parametrize("n", [1.5, 2.0, 3.5])
-def test_a_perfect_source_map_gives_the_profile_back(n: float, operator: Operator) -> None:
+def test_a_perfect_source_map_gives_the_profile_back(n: float) -> None:
     truth = replace(TRUTH, n=n)
-    found = refits([draw_of(on_grid(truth) * 1e6)], operator, n=n)
+    found = refits([draw_of(on_grid(truth) * 1e6)], n=n)
     assert len(found) == 9
     for refit in found.values():
         (fit,) = refit.fits
@@ -109,112 +98,11 @@ def test_a_perfect_source_map_gives_the_profile_back(n: float, operator: Operato
         assert (fit.n_at_bound, fit.r_eff_at_bound) == (False, False)
 
 
-def ray_traced(case: Case, host: SersicProfile, *, noise: float = 0.0, seed: int = 0) -> Operator:
-    """The operator of a case whose data are a ray-traced host and its amplitude columns."""
-    operator = case.operator()
-    arc = operator.blurring @ RayTracedModel(operator, LENS).columns(shape_of(host))[:, -1] * host.flux
-    sigma = 1e-3 * np.sqrt(case.covariance)
-    data = arc + case.columns.sum(axis=1) + noise * sigma * np.random.default_rng(seed).standard_normal(arc.size)
-    case.linear = replace(case.linear, data=data, covariance=sigma**2)
-    return case.operator()
-
-
-@pytest.mark.parametrize("n", [1.0, 1.5, 4.0])
-def test_noise_free_data_give_the_profile_back_by_the_image(n: float) -> None:
-    host = replace(HOST, n=n)
-    operator = ray_traced(Case(amplitudes=2), host)
-    rng = np.random.default_rng(0)
-    draws = [source_draw(invert(operator, LENS, -2.0, SourceModel((14, 14))), LENS, rng)]
-    metric = ImageMetric(operator, draws)
-    low, high = draws[0].bounds((0.3, 8.0))
-    start = shape_of(replace(host, r_eff=0.35, n=2.5, q=0.6, x=0.02))
-    fits = fit_shapes(metric, np.array([0]), start[None], low[None], high[None])
-    # It ends within 0.05 of a standard deviation, and these are 1e-3 at most here.
-    assert fits.converged.all()
-    assert fits.fluxes[0] == pytest.approx(400.0, rel=2e-4)
-    assert np.abs(fits.shapes[0] - shape_of(host)).max() < 1e-3
-
-
-def test_the_image_metric_is_the_chi2_of_the_data_with_free_amplitudes() -> None:
-    case = Case(amplitudes=3, correlated=True)
-    operator = case.operator()
-    draw = draw_of(on_grid(HOST))
-    shape = shape_of(HOST)
-    found = ImageMetric(operator, [draw]).normal_equations(np.array([0]), shape[None])
-    columns = operator.blurring @ RayTracedModel(operator, LENS).columns(shape)
-    inverse = np.linalg.inv(case.covariance)
-    u = case.columns
-    projector = inverse - inverse @ u @ np.linalg.inv(u.T @ inverse @ u) @ u.T @ inverse
-    assert np.allclose(found.gram[0], columns.T @ projector @ columns, rtol=1e-8)
-    assert np.allclose(found.right[0], columns.T @ projector @ case.data, rtol=1e-8)
-
-
-def test_what_the_draws_share_does_not_move_their_fits() -> None:
-    operator = ray_traced(Case(amplitudes=2), HOST, noise=30.0)
-    rng = np.random.default_rng(0)
-    lenses = [LENS.with_values(theta_E=LENS.theta_E + 2e-3 * k, slope=LENS.slope + 0.01 * k) for k in (-1, 0, 2)]
-    draws = [source_draw(invert(operator, lens, -2.0, SourceModel((14, 14))), lens, rng) for lens in lenses]
-    low, high = (np.array(side) for side in zip(*(draw.bounds((0.3, 8.0)) for draw in draws), strict=True))
-    start = np.repeat(shape_of(HOST)[None], 3, axis=0)
-    together = ImageMetric(operator, draws)
-    together.normal_equations(np.array([0]), start[:1])
-    shared = fit_shapes(together, np.arange(3), start, low, high)
-    for k in range(3):
-        own = fit_shapes(ImageMetric(operator, [draws[k]]), np.array([0]), start[:1], low[k : k + 1], high[k : k + 1])
-        sd = np.sqrt(np.diag(np.linalg.inv(own.hessian[0])))
-        # Each ends within 0.05 of a standard deviation of the minimum; the curvature is the first draw's.
-        assert np.abs((shared.shapes[k] - own.shapes[0]) / sd).max() < 0.1
-        assert np.sqrt(np.diag(np.linalg.inv(shared.hessian[k]))) == pytest.approx(sd, rel=0.15)
-
-
-@pytest.mark.parametrize("shift", [0.005, 0.01])
-def test_a_peaked_host_is_found_behind_lenses_that_move_it(shift: float) -> None:
-    """Each lens moves the source by some of its cores: a fit that begins elsewhere blunts the peak."""
-    host = replace(HOST, n=4.0)
-    operator = ray_traced(Case(amplitudes=2), host)
-    rng = np.random.default_rng(0)
-    lenses = [
-        LENS.with_values(x=LENS.x + shift * i, y=LENS.y + shift * j) for i, j in ((0, 0), (2, 1), (-2, 1), (1, -2))
-    ]
-    draws = [source_draw(invert(operator, lens, -2.0, SourceModel((14, 14))), lens, rng) for lens in lenses]
-    together = refits(draws, operator, ESTIMATORS)
-    for k, draw in enumerate(draws):
-        alone = refits([draw], operator, ESTIMATORS)["image", "wide"].fits[0]
-        fit = together["image", "wide"].fits[k]
-        assert fit is not None
-        assert alone is not None
-        assert fit.profile.r_eff == pytest.approx(alone.profile.r_eff, rel=0.05)
-        assert fit.profile.n == pytest.approx(alone.profile.n, abs=0.2)
-
-
-def test_the_ray_traced_model_is_the_noise_free_arc(simulation: Simulation) -> None:
-    observation, scene = simulation.observation, simulation.scene
-    shape, scale = observation.image.shape, observation.pixel_scale
-    x, y = ((np.arange(size) - (size - 1) / 2) * scale for size in shape[::-1])
-    every = np.ones(shape, dtype=np.bool_)
-    rays = cast_rays(every, every, x, y, scale, 2)
-    model = RayTracedModel(_only(rays), scene.lens).columns(shape_of(scene.host))[:, -1].reshape(shape)
-    image = scene.host.flux * convolve(model, pixel_kernel(observation.psf, 2))
-    ring = ring_mask(shape, scale, (scene.lens.x, scene.lens.y), 0.4 * scene.lens.theta_E, 1.65 * scene.lens.theta_E)
-    cores = np.any([ring_mask(shape, scale, (agn.x, agn.y), 0.0, 0.25) for agn in scene.agn], axis=0)
-    seen = ring & ~cores
-    error = (image - simulation.arc)[seen]
-    # The drizzled response to a cusp is not the PSF: exact pixel integrals are off by 0.7 % of the peak as well.
-    assert np.abs(error).max() < 0.012 * simulation.arc[seen].max()
-    assert error.sum() == pytest.approx(0.0, abs=2e-3 * simulation.arc[seen].sum())
-
-
-def _only(rays: RayBundle) -> Operator:
-    """An operator of which only the rays are looked at: it sees nothing of them."""
-    pixels = rays.pixels
-    return build_operator(LinearData(np.zeros(1), np.ones(1), np.zeros((1, 0))), np.zeros((1, pixels)), rays)
-
-
-def test_brighter_by_a_factor_is_brighter_and_nothing_else(operator: Operator) -> None:
+def test_brighter_by_a_factor_is_brighter_and_nothing_else() -> None:
     noise = np.random.default_rng(4).standard_normal(GRID.x.size * GRID.y.size)
     source = on_grid(TRUTH) + 2.0 * noise
-    one = refits([draw_of(source)], operator, ("paper", "covariance"))
-    ten = refits([draw_of(10.0 * source)], operator, ("paper", "covariance"))
+    one = refits([draw_of(source)], ("paper", "covariance"))
+    ten = refits([draw_of(10.0 * source)], ("paper", "covariance"))
     for key, refit in one.items():
         first, second = refit.fits[0], ten[key].fits[0]
         assert first is not None
@@ -225,10 +113,10 @@ def test_brighter_by_a_factor_is_brighter_and_nothing_else(operator: Operator) -
         assert second.profile.n == pytest.approx(first.profile.n, abs=0.01)
 
 
-def test_a_shifted_frame_shifts_the_centre_and_nothing_else(operator: Operator) -> None:
+def test_a_shifted_frame_shifts_the_centre_and_nothing_else() -> None:
     moved = SourceGrid(GRID.x + 0.5, GRID.y - 0.25)
     source = on_grid(TRUTH) + 2.0 * np.random.default_rng(4).standard_normal(GRID.x.size * GRID.y.size)
-    here, there = refits([draw_of(source)], operator), refits([draw_of(source, moved)], operator)
+    here, there = refits([draw_of(source)]), refits([draw_of(source, moved)])
     for key, refit in here.items():
         first, second = refit.fits[0], there[key].fits[0]
         assert first is not None
@@ -239,8 +127,8 @@ def test_a_shifted_frame_shifts_the_centre_and_nothing_else(operator: Operator) 
             assert getattr(second.profile, name) == pytest.approx(getattr(expected, name), rel=1e-5), (key, name)
 
 
-def test_an_index_beyond_the_range_ends_at_the_bound_and_is_flagged(operator: Operator) -> None:
-    found = refits([draw_of(on_grid(replace(TRUTH, n=6.0)))], operator, ("paper",))
+def test_an_index_beyond_the_range_ends_at_the_bound_and_is_flagged() -> None:
+    found = refits([draw_of(on_grid(replace(TRUTH, n=6.0)))], ("paper",))
     free, wide = found["paper", "free"].fits[0], found["paper", "wide"].fits[0]
     assert free is not None
     assert wide is not None
@@ -250,17 +138,17 @@ def test_an_index_beyond_the_range_ends_at_the_bound_and_is_flagged(operator: Op
     assert wide.profile.n == pytest.approx(6.0, abs=0.05)
 
 
-def test_a_point_ends_at_the_bound_of_the_radius(operator: Operator) -> None:
+def test_a_point_ends_at_the_bound_of_the_radius() -> None:
     source = np.zeros(GRID.shape)
     source[14, 15] = 1000.0
-    fit = refits([draw_of(source.ravel())], operator, ("paper",))["paper", "wide"].fits[0]
+    fit = refits([draw_of(source.ravel())], ("paper",))["paper", "wide"].fits[0]
     assert fit is not None
     assert fit.r_eff_at_bound
 
 
-def test_a_fit_within_the_narrower_range_is_the_same_in_both(operator: Operator) -> None:
+def test_a_fit_within_the_narrower_range_is_the_same_in_both() -> None:
     source = on_grid(TRUTH) + 2.0 * np.random.default_rng(4).standard_normal(GRID.x.size * GRID.y.size)
-    found = refits([draw_of(source)] * 3, operator)
+    found = refits([draw_of(source)] * 3)
     for estimator in ON_MAPS:
         assert found[estimator, "wide"].fits == found[estimator, "free"].fits
 
@@ -276,19 +164,19 @@ def test_the_projected_metric_is_the_chi2_of_the_data() -> None:
     )
     oversmoothed = invert(scene.operator(), LENS, 12.0, SourceModel((16, 16)))
     draw = source_draw(oversmoothed, LENS, np.random.default_rng(0))
-    fit = refits([draw], operator, ("projected",))["projected", "wide"].fits[0]
+    fit = refits([draw], ("projected",))["projected", "wide"].fits[0]
     assert fit is not None
     assert fit.profile.flux == pytest.approx(400.0, rel=0.01)
     assert fit.profile.r_eff == pytest.approx(0.25, rel=0.02)
 
 
-def test_the_projected_scatter_covers_the_noise(operator: Operator) -> None:
+def test_the_projected_scatter_covers_the_noise() -> None:
     rng = np.random.default_rng(2)
     clean = on_grid(TRUTH)
     fluxes, spreads = [], []
     for _ in range(40):
         noisy = clean + 10.0 * rng.standard_normal(clean.size)
-        found = refits([draw_of(noisy, precision=0.01)] * 12, operator, ("projected",), 2.0)["projected", "fixed"]
+        found = refits([draw_of(noisy, precision=0.01)] * 12, ("projected",), 2.0)["projected", "fixed"]
         values = [fit.profile.flux for fit in found.fits if fit is not None]
         fluxes.append(np.mean(values))
         spreads.append(np.std(values, ddof=1))
@@ -316,31 +204,11 @@ def test_scatter_at_a_fixed_shape_is_the_noise_of_the_flux_and_stays_inside_boun
     assert shapes[:, 5].std() > 0.0
 
 
-def test_the_image_scatter_covers_the_noise() -> None:
-    fluxes, spreads = [], []
-    for seed in range(40):
-        operator = ray_traced(Case(amplitudes=2), HOST, noise=300.0, seed=seed)
-        coupling = replace(operator.coupling, blocks=operator.coupling.blocks / 9e4)
-        operator = replace(
-            operator, coupling=coupling, border=operator.border / 300.0, wd=operator.wd / 9e4, dd=operator.dd / 9e4
-        )
-        draws = [
-            source_draw(invert(operator, LENS, 3.0, SourceModel((10, 10))), LENS, np.random.default_rng(seed))
-        ] * 12
-        values = [fit.profile.flux for fit in refits(draws, operator, ("image",), 1.5)["image", "fixed"].fits if fit]
-        assert len(values) == 12
-        fluxes.append(np.mean(values))
-        spreads.append(np.std(values, ddof=1))
-    # As above.
-    assert np.std(fluxes) / np.mean(spreads) == pytest.approx(1.0, abs=0.35)
-    assert np.mean(fluxes) == pytest.approx(400.0, abs=4 * np.std(fluxes) / 40**0.5)
-
-
-def test_an_estimator_without_an_answer_is_missing_with_a_warning_and_the_others_stay(operator: Operator) -> None:
+def test_an_estimator_without_an_answer_is_missing_with_a_warning_and_the_others_stay() -> None:
     # The drawn map is dark, the data are not: what looks at maps has no answer, what looks at data has.
     lit = draw_of(on_grid(TRUTH) * 1e3)
     draws = [replace(lit, mean=-lit.mean, drawn=-lit.drawn)] * 3
-    drawn = DrawSet(operator, tuple(draws))
+    drawn = DrawSet(tuple(draws), {})
     _, estimates, aperture, warnings = _refit(drawn, 25.0, Truth(LENS, TRUTH), 2.0, np.random.default_rng(0))
     names = {estimate.estimator for estimate in estimates}
     assert "projected" in names
@@ -360,7 +228,7 @@ def test_a_host_fainter_than_the_noise_gives_finite_numbers_and_counts_what_fail
     operator = case.operator()
     rng = np.random.default_rng(6)
     draws = [source_draw(invert(operator, LENS, 2.0, SourceModel((10, 10))), LENS, rng) for _ in range(8)]
-    drawn = DrawSet(operator, tuple(draws))
+    drawn = DrawSet(tuple(draws), {})
     _, estimates, aperture, warnings = _refit(drawn, 25.0, Truth(LENS, HOST), 1.5, np.random.default_rng(0))
     assert len(estimates) + len([warning for warning in warnings if "estimator" in warning]) == 12
     assert any(0 < estimate.failed < 8 for estimate in estimates)

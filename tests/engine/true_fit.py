@@ -23,6 +23,7 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         lens_names=names,
         lens_covariance=1e-6 * np.eye(len(names)),
         host_covariance=1e-6 * np.eye(7),
+        hosts={},
         at_bound=(),
         model=np.zeros(shape),
         arc=np.zeros(shape),
