@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ from engine.modelling.starts import (
     agn_hypotheses,
     deflector_centre,
     filled_image,
-    ring_radius,
+    ring_radii,
     starts_from_agn,
     starts_from_arc,
 )
@@ -46,6 +47,10 @@ _QUICK_WINDOW = 1.6
 """Half-width of the window of the quick fits in Einstein radii, to which a margin comes."""
 _QUICK_MARGIN = 0.5
 _QUICK_STEPS, _STEPS = 15, 40
+_SAMPLED_TOLERANCE, _TOLERANCE = 1e-4, 1e-6
+"""Relative change of cost or parameters at which a fit with derivatives of samples, or of integrals, ends."""
+_RIVAL = 2.0
+"""BIC of a quick fit, of that of the best, up to which another number of AGN images is still a rival."""
 _STAMP_SHIFT = 0.003
 """Error of a moved PSF stamp, as a shift [arcsec]: a drizzled pixel does not see its light where its centre is."""
 _STAMP_ERROR = 0.005
@@ -146,12 +151,21 @@ def _bounds(layout: Layout, start: FloatArray, pixel_scale: float) -> tuple[Floa
     return low, high
 
 
-def _minimise(model: ImageModel, start: Start, values: FloatArray, steps: int, tolerance: float) -> _Solution:
+def _minimise(
+    model: ImageModel,
+    start: Start,
+    values: FloatArray,
+    steps: int,
+    tolerance: float,
+    *,
+    integrated: bool = False,
+) -> _Solution:
+    """Least squares; with ``integrated`` the derivatives are those of the integrated light, not of samples."""
     low, high = _bounds(model.layout, values, model.observation.pixel_scale)
     inside = np.clip(values, low + 1e-6, high - 1e-6)
     fit = least_squares(
-        model.residuals, inside, model.jacobian, (low, high), x_scale="jac", xtol=tolerance, ftol=tolerance,
-        max_nfev=steps,
+        model.residuals, inside, partial(model.jacobian, integrated=integrated), (low, high), x_scale="jac",
+        xtol=tolerance, ftol=tolerance, max_nfev=steps,
     )  # fmt: skip
     return _Solution(model, fit.x, 2.0 * float(fit.cost), int(fit.nfev), start)
 
@@ -289,8 +303,8 @@ class _Finder:
             if len(agn) >= 2:
                 groups.append(starts_from_agn(agn, self.centre))
             else:
-                rough = theta_E or ring_radius(self.image, self.observation.pixel_scale, self.centre)
-                groups.append(starts_from_arc(rough, self.centre, agn))
+                rough = (theta_E,) if theta_E else ring_radii(self.image, self.observation.pixel_scale, self.centre)
+                groups.append([start for radius in rough for start in starts_from_arc(radius, self.centre, agn)])
         return groups
 
     def _fitted(self, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray[np.bool_]:
@@ -356,30 +370,36 @@ class _Finder:
     def ranked(self, groups: list[list[_Solution]], *, shear: bool) -> list[_Solution]:
         """The two solutions to go on with, the better one first.
 
-        A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so solutions with and
-        without AGN are compared as fits of full accuracy, with ``shear`` where there may be some, on one noise map.
+        A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so the best quick fits with
+        each number of them that is not out of the question, and that without, are compared as fits of full accuracy,
+        with ``shear`` where there may be some, on one noise map.
         """
         best = sorted((min(group, key=_information) for group in groups if group), key=_information)
         if len(best) == 1:
-            return sorted(groups[0], key=_information)[:2]
-        rivals = [next((s for s in best if bool(s.model.layout.n_agn) is with_agn), None) for with_agn in (True, False)]
-        chosen = [solution for solution in rivals if solution is not None]
+            return sorted((solution for group in groups for solution in group), key=_information)[:2]
+        with_agn = [solution for solution in best if solution.model.layout.n_agn]
+        chosen = [solution for solution in best if not solution.model.layout.n_agn]
+        chosen += [s for s in with_agn if _information(s) < _RIVAL * _information(with_agn[0])]
         if len(chosen) < 2:
             return best[:2]
-        sigma = self._sigma(chosen[0])
-        rated: list[tuple[float, int]] = []
-        for k, solution in enumerate(chosen):
-            layout = replace(solution.model.layout, shear=shear)
-            values = _with_shear(solution.values, solution.model.layout, shear=shear)
-            full = _minimise(self._model(layout, sigma), solution.start, values, _STEPS, 1e-4)
-            self.evaluations += full.evaluations
-            rated.append((_information(full), k))
-        return [chosen[k] for _, k in sorted(rated)]
+        sigma = self._sigma(with_agn[0] if with_agn else chosen[0])
+        full = [self._full(solution, sigma, shear=shear) for solution in chosen]
+        return sorted(full, key=_information)[:2]
 
-    def _sigma(self, quick: _Solution) -> FloatArray:
-        """Standard deviation of the pixels of the final fit, with the error of the AGN as they were quickly fitted."""
-        values, layout = quick.values, quick.model.layout
-        agn = _fitted_agn(layout, values, quick.model.amplitudes(values)[0], quick.start.agn)
+    def _full(self, solution: _Solution, sigma: FloatArray, *, shear: bool) -> _Solution:
+        """The fit of the whole image that begins where another ended."""
+        layout = solution.model.layout
+        values = _with_shear(solution.values, layout, shear=shear)
+        model = self._model(replace(layout, shear=shear), sigma)
+        sampled = _minimise(model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE)
+        found = _minimise(model, solution.start, sampled.values, _STEPS, _TOLERANCE, integrated=True)
+        self.evaluations += sampled.evaluations + found.evaluations
+        return found
+
+    def _sigma(self, solution: _Solution) -> FloatArray:
+        """Standard deviation of the pixels of the final fit, with the error of the AGN as they were fitted."""
+        values, layout = solution.values, solution.model.layout
+        agn = _fitted_agn(layout, values, solution.model.amplitudes(values)[0], solution.start.agn)
         sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
         sigma[~self._fitted(lens_of(values[layout.lens_slice]), agn)] = np.inf
         return sigma
@@ -388,28 +408,17 @@ class _Finder:
         ny, nx = self.observation.shape
         return ImageModel(self.observation, layout, sigma, (slice(0, ny), slice(0, nx)), subrays=_SUBRAYS, exact=True)
 
-    def polish(self, quick: _Solution, *, shear: bool | None) -> _Solution:
-        """The fit of the whole image from a quick one; with shear where it is wanted, or is worth its parameters."""
-        values, layout = quick.values, quick.model.layout
-        sigma = self._sigma(quick)
-
-        def model(with_shear: bool) -> ImageModel:
-            return self._model(replace(layout, shear=with_shear), sigma)
-
-        if shear:
-            best = _minimise(model(True), quick.start, _with_shear(values, layout, shear=True), _STEPS, 1e-6)
-        else:
-            best = _minimise(model(False), quick.start, _with_shear(values, layout, shear=False), _STEPS, 1e-6)
-            if shear is None:
-                beside = _with_shear(best.values, best.model.layout, shear=True)
-                other = _minimise(model(True), quick.start, beside, _STEPS, 1e-6)
-                self.evaluations += other.evaluations
-                if best.cost - other.cost > 2.0 * math.log(best.model.pixels):
-                    best = other
-        self.evaluations += best.evaluations
+    def polish(self, solution: _Solution, *, shear: bool | None) -> _Solution:
+        """The fit of the whole image from another one; with shear where it is wanted, or is worth its parameters."""
+        sigma = self._sigma(solution)
+        best = self._full(solution, sigma, shear=shear is not False)
+        if shear is None:
+            without = self._full(best, sigma, shear=False)
+            if without.cost - best.cost <= 2.0 * math.log(best.model.pixels):
+                best = without
         for _ in range(_CORRECTIONS if self.observation.response is not None else 0):
             best.model.correct(best.values)
-            best = _minimise(best.model, best.start, best.values, _STEPS, 1e-6)
+            best = _minimise(best.model, best.start, best.values, _STEPS, _TOLERANCE, integrated=True)
             self.evaluations += best.evaluations
         return best
 
