@@ -20,6 +20,7 @@ from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
 from engine.modelling.parametric import HOST_NAMES, Acceptance, ParametricFit, fit_parametric
+from engine.modelling.psf_error import noise_scale
 from engine.result import Estimate, LensParameter
 from engine.run import Measurement, measure
 from engine.spec import PROFILES, Analysis
@@ -34,10 +35,6 @@ POOR_FIT = 1.5
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
 _NORMAL_95 = 1.959963985
-_MAD = 1.4826
-_OUTSKIRTS = 1.6
-"""Einstein radii from the lens beyond which residuals tell the noise and not the model."""
-_FEWEST_PIXELS = 200
 _NOISE_AGREES = 0.1
 
 
@@ -160,20 +157,6 @@ def measured(mean: float, sd: float) -> Measured:
     return Measured(mean, sd, (mean - _NORMAL_95 * sd, mean + _NORMAL_95 * sd))
 
 
-def _noise_scale(observation: Observation, fit: ParametricFit) -> float:
-    """Scatter of the residuals outside the lens in units of the noise map, by the median of their moduli."""
-    ny, nx = observation.shape
-    scale = observation.pixel_scale
-    x = (np.arange(nx) - (nx - 1) / 2.0) * scale - fit.lens.x
-    y = (np.arange(ny) - (ny - 1) / 2.0) * scale - fit.lens.y
-    far = np.hypot(y[:, None], x[None, :]) > _OUTSKIRTS * fit.lens.theta_E
-    chosen = far & np.isfinite(fit.sigma)
-    if int(chosen.sum()) < _FEWEST_PIXELS:
-        return 1.0
-    residual = (observation.image - fit.model)[chosen] / fit.sigma[chosen]
-    return _MAD * float(np.median(np.abs(residual)))
-
-
 def _chi2(observation: Observation, fit: ParametricFit, scale: float) -> float:
     """chi^2 with the noise map times ``scale`` and the error of the AGN's light as it is."""
     used = np.isfinite(fit.sigma)
@@ -291,7 +274,7 @@ def measure_image(
                 )
             except (PosteriorError, InversionError, ObservationError) as error:
                 warnings.append(f"inversion: {error}")
-    scale = _noise_scale(observation, fit)
+    scale = noise_scale(observation, observation.image - fit.model, fit.sigma, fit.lens)
     chi2 = _chi2(observation, fit, scale) / fit.degrees_of_freedom
     if abs(scale - 1.0) > _NOISE_AGREES:
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")

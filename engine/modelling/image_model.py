@@ -185,7 +185,7 @@ class ImageModel:
             fine = render_sersic(profile, blur.x, blur.y, blur.side, lens, RENDER_TOLERANCE)
         else:
             fine = sample_sersic(profile, lens, blur.x, blur.y, blur.side)
-        return blur(fine).ravel() * self.weight
+        return blur(fine, integrated=exact).ravel() * self.weight
 
     def _render_deflector(self, *values: float) -> FloatArray:
         return self._light(sersic_of(values), None, exact=self.exact)
@@ -237,6 +237,13 @@ class ImageModel:
         scaled = columns / size
         best = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ self.data, rcond=1e-12)[0]
         return best / size, self.data - scaled @ best, columns
+
+    def unwhitened(self, columns: FloatArray, amplitudes: FloatArray) -> FloatArray:
+        """Image (ny, nx) [e-/s] of some of the whitened columns; zero where pixels do not count and off the window."""
+        image = np.zeros(self.observation.shape)
+        safe = np.where(self.weight > 0, self.weight, np.inf)
+        image[self.window] = (columns @ amplitudes / safe).reshape(self.shape)
+        return image
 
     def constraints(self, values: FloatArray) -> FloatArray:
         """Scatter of the AGN images in the source plane about the host, and the priors, each in its own error."""

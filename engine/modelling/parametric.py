@@ -32,6 +32,7 @@ from engine.modelling.image_model import (
     window_round,
 )
 from engine.modelling.point_sources import Detection, candidate_point_sources
+from engine.modelling.psf_error import extended_variance, measured_stamp_error, noise_scale, stamp_variance
 from engine.modelling.starts import (
     Start,
     agn_hypotheses,
@@ -49,16 +50,15 @@ _QUICK_MARGIN = 0.5
 _QUICK_STEPS, _STEPS = 15, 40
 _SAMPLED_TOLERANCE, _TOLERANCE = 1e-4, 1e-6
 """Relative change of cost or parameters at which a fit with derivatives of samples, or of integrals, ends."""
+_SHEAR_SHOWS = 4.0
+"""Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
+
+Dropping a shear that there is biases all of the lens, keeping one that there is not costs a little precision.
+"""
 _RIVAL = 2.0
 """BIC of a quick fit, of that of the best, up to which another number of AGN images is still a rival."""
-_STAMP_SHIFT = 0.003
-"""Error of a moved PSF stamp, as a shift [arcsec]: a drizzled pixel does not see its light where its centre is."""
-_STAMP_ERROR = 0.005
-"""And as a fraction of the AGN's light."""
 _STAMP_CORRELATION = 2.0
 """Pixels over which the error of a stamp stays the same, as the standard deviation of a Gaussian."""
-_RESPONSE_ERROR = 0.002
-"""The same where the exposures are known: what errors of position leave."""
 _MAX_ELLIPTICITY = 0.6
 _CORRECTIONS = 2
 """Rounds in which the images of deflector and host are corrected by those through the exposures, if these are known."""
@@ -92,7 +92,8 @@ class ParametricFit:
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
     that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
     chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
-    their noise and the error of the PSF, infinite where a pixel was not fitted. ``model`` and ``arc`` are images
+    their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many times
+    what is allowed for moved stamps the residuals at AGN images show. ``model`` and ``arc`` are images
     (ny, nx) of everything and of the lensed host [e-/s].
     """
 
@@ -107,6 +108,7 @@ class ParametricFit:
     chi2: float
     degrees_of_freedom: int
     evaluations: int
+    stamp_error: float
     at_bound: tuple[str, ...]
     model: FloatArray
     arc: FloatArray
@@ -177,21 +179,6 @@ def _stamp_radius(psf: FloatArray) -> int:
     return int(min(middle - rows[0], rows[-1] - middle, middle - columns[0], columns[-1] - middle))
 
 
-def _stamp_variance(observation: Observation, agn: Sequence[Detection]) -> FloatArray:
-    """Variance (ny, nx) of what the AGN images put on the pixels but no model of them can predict."""
-    variance = np.zeros(observation.shape)
-    scale = observation.pixel_scale
-    if not agn:
-        return variance
-    light = np.zeros(observation.shape)
-    for found in agn:
-        light += found.flux * observation.point_source(found.x, found.y)
-    if observation.response is not None:
-        return np.asarray((_RESPONSE_ERROR * light) ** 2)
-    steep = sum(np.asarray(slope) ** 2 for slope in np.gradient(light, scale))
-    return np.asarray((_STAMP_ERROR * light) ** 2 + _STAMP_SHIFT**2 * steep)
-
-
 def _refuse(options: dict[str, tuple[object, bool, str]]) -> None:
     for name, (value, good, allowed) in options.items():
         if not good:
@@ -218,7 +205,7 @@ def fit_parametric(
     deflector : bool
         Whether the deflector shines: a component that is absent is not built.
     shear : bool, optional
-        Whether the lens has external shear; where None it has where the BIC asks for it.
+        Whether the lens has external shear; where None it has where the fit's differs from none.
     theta_E : float, optional
         Rough Einstein radius [arcsec].
     positions : sequence of (x, y), optional
@@ -233,7 +220,7 @@ def fit_parametric(
     PosteriorError
         No start leads to an acceptable fit; the message says what is wrong with the best.
     """
-    finder = _Finder(observation, deflector=deflector, acceptance=acceptance)
+    finder = _Finder(observation, deflector=deflector, shear=shear, acceptance=acceptance)
     radius = min(observation.shape) * observation.pixel_scale / 2
     _refuse(
         {
@@ -244,9 +231,9 @@ def fit_parametric(
     groups = finder.starts(agn_images, theta_E, positions)
     refusals: list[str] = []
     for wave in (groups, [_varied(group) for group in groups]):
-        for solution in finder.ranked([finder.quick(group) for group in wave], shear=shear is not False):
+        for solution in finder.ranked([finder.quick(group) for group in wave]):
             try:
-                return finder.result(finder.polish(solution, shear=shear))
+                return finder.result(finder.polish(solution))
             except PosteriorError as error:
                 refusals.append(str(error))
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
@@ -271,8 +258,12 @@ def _varied(group: list[Start]) -> list[Start]:
 class _Finder:
     """The stages of the search for one observation."""
 
-    def __init__(self, observation: Observation, *, deflector: bool, acceptance: Acceptance) -> None:
+    def __init__(
+        self, observation: Observation, *, deflector: bool, shear: bool | None, acceptance: Acceptance
+    ) -> None:
         self.observation, self.has_deflector, self.acceptance = observation, deflector, acceptance
+        self.shear, self.may_shear = shear, shear is not False
+        self.stamp_error = 1.0
         self.image = filled_image(observation)
         self.noise = np.where(
             observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
@@ -335,9 +326,10 @@ class _Finder:
         window = window_round(
             observation.shape, observation.pixel_scale, self.centre, _QUICK_WINDOW * reach + _QUICK_MARGIN
         )
-        layout = Layout(len(first.agn), self.has_deflector, shear=first.lens.gamma1 != 0.0)
+        # Without it an arc that was sheared ends in one of several false minima, far from the true lens.
+        layout = Layout(len(first.agn), self.has_deflector, shear=self.may_shear or first.lens.gamma1 != 0.0)
         # One noise map for all hypotheses, or their chi^2 could not be compared.
-        sigma = weights_sigma(observation, _stamp_variance(observation, self._candidates(4)))
+        sigma = weights_sigma(observation, stamp_variance(observation, self._candidates(4)))
         model = ImageModel(observation, layout, sigma, window, subrays=_QUICK_SUBRAYS, exact=False)
         if len(group) > 2 * _ARC_STARTS:
             group = self._best_linear(model, group)
@@ -367,12 +359,12 @@ class _Finder:
                 break
         return chosen
 
-    def ranked(self, groups: list[list[_Solution]], *, shear: bool) -> list[_Solution]:
+    def ranked(self, groups: list[list[_Solution]]) -> list[_Solution]:
         """The two solutions to go on with, the better one first.
 
         A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so the best quick fits with
-        each number of them that is not out of the question, and that without, are compared as fits of full accuracy,
-        with ``shear`` where there may be some, on one noise map.
+        each number of them that is not out of the question, and that without, are compared as fits of full accuracy
+        on one noise map.
         """
         best = sorted((min(group, key=_information) for group in groups if group), key=_information)
         if len(best) == 1:
@@ -383,7 +375,7 @@ class _Finder:
         if len(chosen) < 2:
             return best[:2]
         sigma = self._sigma(with_agn[0] if with_agn else chosen[0])
-        full = [self._full(solution, sigma, shear=shear) for solution in chosen]
+        full = [self._full(solution, sigma, shear=self.may_shear) for solution in chosen]
         return sorted(full, key=_information)[:2]
 
     def _full(self, solution: _Solution, sigma: FloatArray, *, shear: bool) -> _Solution:
@@ -396,31 +388,64 @@ class _Finder:
         self.evaluations += sampled.evaluations + found.evaluations
         return found
 
-    def _sigma(self, solution: _Solution) -> FloatArray:
-        """Standard deviation of the pixels of the final fit, with the error of the AGN as they were fitted."""
+    def _variances(self, solution: _Solution) -> tuple[FloatArray, FloatArray]:
+        """Variance (ny, nx) allowed for the stamps of the AGN images as they were fitted, and for extended light."""
         values, layout = solution.values, solution.model.layout
+        amplitudes, _, columns = solution.model.amplitudes(values)
+        stamps = stamp_variance(self.observation, _fitted_agn(layout, values, amplitudes, solution.start.agn))
+        extended = slice(layout.n_agn, -1)
+        light = solution.model.unwhitened(columns[:, extended], amplitudes[extended])
+        return stamps, extended_variance(self.observation, light)
+
+    def _sigma(self, solution: _Solution) -> FloatArray:
+        """Standard deviation of the pixels of the final fit, the PSF's errors included; infinite where not fitted."""
+        values, layout = solution.values, solution.model.layout
+        stamps, extended = self._variances(solution)
+        sigma = weights_sigma(self.observation, self.stamp_error**2 * stamps + extended)
         agn = _fitted_agn(layout, values, solution.model.amplitudes(values)[0], solution.start.agn)
-        sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
         sigma[~self._fitted(lens_of(values[layout.lens_slice]), agn)] = np.inf
         return sigma
+
+    def _measured_stamp_error(self, solution: _Solution) -> float:
+        """Error of the AGN's stamps in units of what is allowed for, as the residuals of a full fit have it."""
+        model, values, layout = solution.model, solution.values, solution.model.layout
+        if not layout.n_agn or self.observation.response is not None:
+            return 1.0
+        _, rest, _ = model.amplitudes(values)
+        counted = np.isfinite(model.sigma)
+        residual = rest.reshape(self.observation.shape) * np.where(counted, model.sigma, 0.0)
+        stamps, extended = self._variances(solution)
+        noise = weights_sigma(self.observation)
+        scale = noise_scale(self.observation, residual, model.sigma, lens_of(values[layout.lens_slice]))
+        others = np.where(counted, (scale * noise) ** 2 + extended, np.inf)
+        return measured_stamp_error(residual, stamps, others)
 
     def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
         ny, nx = self.observation.shape
         return ImageModel(self.observation, layout, sigma, (slice(0, ny), slice(0, nx)), subrays=_SUBRAYS, exact=True)
 
-    def polish(self, solution: _Solution, *, shear: bool | None) -> _Solution:
+    def polish(self, solution: _Solution) -> _Solution:
         """The fit of the whole image from another one; with shear where it is wanted, or is worth its parameters."""
-        sigma = self._sigma(solution)
-        best = self._full(solution, sigma, shear=shear is not False)
-        if shear is None:
-            without = self._full(best, sigma, shear=False)
-            if without.cost - best.cost <= 2.0 * math.log(best.model.pixels):
-                best = without
+        best = self._full(solution, self._sigma(solution), shear=self.may_shear)
+        error = self._measured_stamp_error(best)
+        if error != self.stamp_error:
+            self.stamp_error = error
+            best = self._full(best, self._sigma(best), shear=self.may_shear)
+        if self.shear is None and not self._shear_shows(best):
+            best = self._full(best, best.model.sigma, shear=False)
         for _ in range(_CORRECTIONS if self.observation.response is not None else 0):
             best.model.correct(best.values)
             best = _minimise(best.model, best.start, best.values, _STEPS, _TOLERANCE, integrated=True)
             self.evaluations += best.evaluations
         return best
+
+    def _shear_shows(self, solution: _Solution) -> bool:
+        """Whether a fit's shear differs from none by more than its covariance lets expect."""
+        jacobian, _ = solution.model.full_jacobian(solution.values)
+        covariance = _covariance(jacobian, self._shared(solution.model, jacobian[: solution.model.data.size]))
+        where = slice(solution.model.layout.lens_slice.stop - 2, solution.model.layout.lens_slice.stop)
+        shear = solution.values[where]
+        return bool(shear @ np.linalg.solve(covariance[where, where], shear) > _SHEAR_SHOWS)
 
     def _shared(self, model: ImageModel, jacobian: FloatArray) -> FloatArray:
         """J^T (C - diag C) J of the whitened Jacobian: what pixels share of their noise and of the stamps' error."""
@@ -484,6 +509,7 @@ class _Finder:
             chi2=chi2,
             degrees_of_freedom=freedom,
             evaluations=self.evaluations,
+            stamp_error=self.stamp_error,
             at_bound=_at_bound(solution),
             model=(columns @ amplitudes).reshape(shape),
             arc=(columns[:, -2] * flux).reshape(shape),
