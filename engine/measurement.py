@@ -36,6 +36,8 @@ _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
 _NORMAL_95 = 1.959963985
 _NOISE_AGREES = 0.1
+_WRONG_STAMP = 2.0
+"""Error of the PSF's stamp, in units of what is allowed for, from which on the result says so."""
 
 
 def profile_analysis(profile: str, observation: Observation) -> Analysis:
@@ -138,6 +140,10 @@ class ImageMeasurement:
                 else {name: asdict(value) for name, value in self.lens_by_inversion.items()}
             ),
             "chain": None if chain is None else asdict(chain),
+            "inversion_chi2_per_dof": (
+                None if self.inversion is None else self.inversion.chi2 / self.inversion.degrees_of_freedom
+            ),
+            "stamp_error": fit.stamp_error,
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,
             "deflector": None if fit.deflector is None else asdict(fit.deflector),
@@ -285,6 +291,8 @@ def measure_image(
     if found is not None:
         estimates += [_host_estimate(estimate) for estimate in found.estimates if estimate.index_prior == "wide"]
         warnings += found.warnings
+    if fit.stamp_error > _WRONG_STAMP:
+        warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     by_name = {estimate.estimator: estimate for estimate in estimates}
     preferred = RECOMMENDED if observation.response is not None else RECOMMENDED_BY_STAMP

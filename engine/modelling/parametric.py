@@ -47,9 +47,11 @@ _QUICK_SUBRAYS, _SUBRAYS = 1, 2
 _QUICK_WINDOW = 1.6
 """Half-width of the window of the quick fits in Einstein radii, to which a margin comes."""
 _QUICK_MARGIN = 0.5
-_QUICK_STEPS, _STEPS = 15, 40
+_QUICK_STEPS, _STEPS, _INTEGRATED_STEPS = 15, 40, 15
 _SAMPLED_TOLERANCE, _TOLERANCE = 1e-4, 1e-6
 """Relative change of cost or parameters at which a fit with derivatives of samples, or of integrals, ends."""
+_HOPELESS = 2.0
+"""Times what is acceptable from which on a fit is not worth the derivatives of integrated light."""
 _SHEAR_SHOWS = 4.0
 """Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
 
@@ -384,8 +386,11 @@ class _Finder:
         values = _with_shear(solution.values, layout, shear=shear)
         model = self._model(replace(layout, shear=shear), sigma)
         sampled = _minimise(model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE)
-        found = _minimise(model, solution.start, sampled.values, _STEPS, _TOLERANCE, integrated=True)
-        self.evaluations += sampled.evaluations + found.evaluations
+        self.evaluations += sampled.evaluations
+        if sampled.cost > _HOPELESS * self.acceptance.chi2_per_dof * model.pixels:
+            return sampled
+        found = _minimise(model, solution.start, sampled.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
+        self.evaluations += found.evaluations
         return found
 
     def _variances(self, solution: _Solution) -> tuple[FloatArray, FloatArray]:
@@ -435,7 +440,7 @@ class _Finder:
             best = self._full(best, best.model.sigma, shear=False)
         for _ in range(_CORRECTIONS if self.observation.response is not None else 0):
             best.model.correct(best.values)
-            best = _minimise(best.model, best.start, best.values, _STEPS, _TOLERANCE, integrated=True)
+            best = _minimise(best.model, best.start, best.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
             self.evaluations += best.evaluations
         return best
 
