@@ -30,11 +30,6 @@ _INDEPENDENCE_SHARE = 0.9
 _BURN_IN_ROUNDS, _BURN_IN_STEPS = 2, 20
 _TRUSTED_SAMPLES = 25.0
 """Samples a parameter from which the burn-in tells as much of the covariance as the approximation does."""
-_REVIEWS, _SLOW = (60, 120), 5.0
-"""Steps after which a chain of so long an autocorrelation time goes to the burn-in, and mends the proposal once more.
-
-An approximation too narrow by a third leaves walkers in the tails for dozens of steps.
-"""
 _CHUNK = 15
 _WINDOW = 5
 AUTOCORRELATION_TIMES = 50.0
@@ -148,20 +143,11 @@ def run_chain(
         burnt = sampler.get_chain(discard=_BURN_IN_STEPS // 2, flat=True)
         proposal.update(*_blend(burnt, laplace))
         sampler.reset()
-    tau, steps, burn_in = math.inf, 0, _BURN_IN_ROUNDS * _BURN_IN_STEPS
-    reviews = list(_REVIEWS)
+    tau, steps = math.inf, 0
     while steps < max_steps and steps < length * tau:
         state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
         steps = sampler.iteration
         tau = autocorrelation_time(sampler.get_chain())
-        if reviews and steps >= reviews[0]:
-            reviews.pop(0)
-            if tau > _SLOW:
-                proposal.update(*_blend(sampler.get_chain(flat=True), laplace))
-                sampler.reset()
-                burn_in, steps, tau = burn_in + steps, 0, math.inf
-            else:
-                reviews.clear()
         if progress is not None:
             progress(min(1.0, steps / min(float(max_steps), length * tau)))
     if not math.isfinite(tau):
@@ -171,7 +157,7 @@ def run_chain(
         status=status,
         walkers=walkers,
         steps=steps,
-        burn_in=burn_in,
+        burn_in=_BURN_IN_ROUNDS * _BURN_IN_STEPS,
         tau=tau,
         effective_samples=steps * walkers / tau,
         acceptance=float(np.mean(sampler.acceptance_fraction)),
