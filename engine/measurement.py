@@ -20,25 +20,20 @@ from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
 from engine.modelling.parametric import HOST_NAMES, Acceptance, ParametricFit, fit_parametric
+from engine.modelling.psf_error import noise_scale
 from engine.result import Estimate, LensParameter
 from engine.run import Measurement, measure
 from engine.spec import PROFILES, Analysis
 
-MeasurementStatus = Literal["ok", "not_converged", "poor_fit"]
-RECOMMENDED = ("image", "parametric")
-"""Estimators by preference where the exposures are known: the answer is that of the first which there is."""
-RECOMMENDED_BY_STAMP = ("parametric",)
-"""And where stars are moved stamps: the fit of the whole image allows for their error as far as pixels share it."""
+MeasurementStatus = Literal["ok", "poor_fit"]
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on the status says that the model does not describe the image."""
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
 _NORMAL_95 = 1.959963985
-_MAD = 1.4826
-_OUTSKIRTS = 1.6
-"""Einstein radii from the lens beyond which residuals tell the noise and not the model."""
-_FEWEST_PIXELS = 200
 _NOISE_AGREES = 0.1
+_WRONG_STAMP = 2.0
+"""Error of the PSF's stamp, in units of what is allowed for, from which on the result says so."""
 
 
 def profile_analysis(profile: str, observation: Observation) -> Analysis:
@@ -87,12 +82,12 @@ class AgnPosition:
 class ImageMeasurement:
     """What is found in one image.
 
-    ``host`` is the recommended estimate among ``estimates``; ``lens`` belongs to it. ``chi2_per_dof`` is that of the
-    parametric model with the noise map times ``noise_scale``, the scatter of the residuals outside the lens in units of
-    the map: a drizzled image has less noise in a pixel than its map says where the map allows for what neighbours
-    share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is ``poor_fit`` where chi2_per_dof exceeds
-    :data:`POOR_FIT`, ``not_converged`` where the chain is too short. ``inversion`` is None where none was asked for, or
-    where it failed, which ``warnings`` then say.
+    ``host`` is the parametric fit's, the first of ``estimates``; ``lens`` belongs to it. ``chi2_per_dof`` is that of
+    the parametric model with the noise map times ``noise_scale``, the scatter of the residuals outside the lens in
+    units of the map: a drizzled image has less noise in a pixel than its map says where the map allows for what
+    neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is ``poor_fit`` where chi2_per_dof
+    exceeds :data:`POOR_FIT`. ``inversion`` is None where none was asked for, or where it failed, which ``warnings``
+    then say.
     """
 
     host: HostEstimate
@@ -141,6 +136,10 @@ class ImageMeasurement:
                 else {name: asdict(value) for name, value in self.lens_by_inversion.items()}
             ),
             "chain": None if chain is None else asdict(chain),
+            "inversion_chi2_per_dof": (
+                None if self.inversion is None else self.inversion.chi2 / self.inversion.degrees_of_freedom
+            ),
+            "stamp_error": fit.stamp_error,
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,
             "deflector": None if fit.deflector is None else asdict(fit.deflector),
@@ -158,20 +157,6 @@ class ImageMeasurement:
 def measured(mean: float, sd: float) -> Measured:
     """A quantity with a normal distribution."""
     return Measured(mean, sd, (mean - _NORMAL_95 * sd, mean + _NORMAL_95 * sd))
-
-
-def _noise_scale(observation: Observation, fit: ParametricFit) -> float:
-    """Scatter of the residuals outside the lens in units of the noise map, by the median of their moduli."""
-    ny, nx = observation.shape
-    scale = observation.pixel_scale
-    x = (np.arange(nx) - (nx - 1) / 2.0) * scale - fit.lens.x
-    y = (np.arange(ny) - (ny - 1) / 2.0) * scale - fit.lens.y
-    far = np.hypot(y[:, None], x[None, :]) > _OUTSKIRTS * fit.lens.theta_E
-    chosen = far & np.isfinite(fit.sigma)
-    if int(chosen.sum()) < _FEWEST_PIXELS:
-        return 1.0
-    residual = (observation.image - fit.model)[chosen] / fit.sigma[chosen]
-    return _MAD * float(np.median(np.abs(residual)))
 
 
 def _chi2(observation: Observation, fit: ParametricFit, scale: float) -> float:
@@ -291,7 +276,7 @@ def measure_image(
                 )
             except (PosteriorError, InversionError, ObservationError) as error:
                 warnings.append(f"inversion: {error}")
-    scale = _noise_scale(observation, fit)
+    scale = noise_scale(observation, observation.image - fit.model, fit.sigma, fit.lens)
     chi2 = _chi2(observation, fit, scale) / fit.degrees_of_freedom
     if abs(scale - 1.0) > _NOISE_AGREES:
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")
@@ -300,23 +285,25 @@ def measure_image(
     estimates = [_parametric_estimate(fit, observation.zero_point, inflation)]
     lens = _lens_of_fit(fit, inflation)
     if found is not None:
-        estimates += [_host_estimate(estimate) for estimate in found.estimates if estimate.index_prior == "wide"]
+        # "image" is draws of the parametric fit, which is there already.
+        estimates += [
+            _host_estimate(estimate)
+            for estimate in found.estimates
+            if estimate.index_prior == "wide" and estimate.estimator != "image"
+        ]
         warnings += found.warnings
+    if fit.stamp_error > _WRONG_STAMP:
+        warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
-    by_name = {estimate.estimator: estimate for estimate in estimates}
-    preferred = RECOMMENDED if observation.response is not None else RECOMMENDED_BY_STAMP
-    host = next(by_name[name] for name in preferred if name in by_name)
     status: MeasurementStatus = "ok"
     if chi2 > POOR_FIT:
         status = "poor_fit"
         warnings.append(f"model: chi2 per degree of freedom is {chi2:.2f}; the errors do not cover what it misses")
-    elif found is not None and host.estimator == "image" and found.chain.summary.status != "converged":
-        status = "not_converged"
     by_inversion = None if found is None else _lens_of_chain(found.lens)
     return ImageMeasurement(
-        host=host,
+        host=estimates[0],
         estimates=tuple(estimates),
-        lens=lens if by_inversion is None or host.estimator == "parametric" else by_inversion,
+        lens=lens,
         lens_by_inversion=by_inversion,
         agn=tuple(
             AgnPosition(image.x, image.y, rate_to_magnitude(image.flux, observation.zero_point))

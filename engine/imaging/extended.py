@@ -42,7 +42,8 @@ def deposit_matrix(pixels: int, subrays: int) -> sparse.csr_matrix:
 class StampBlur:
     """Light on sub-pixels through the PSF, on a window of the image and ``outside`` pixels round it.
 
-    ``x`` and ``y`` are the centres of the sub-pixels, ``side`` [arcsec] apart.
+    ``x`` and ``y`` are the centres of the sub-pixels, ``side`` [arcsec] apart. Light that was integrated over the
+    sub-pixels has been smoothed by them, beside what the PSF does: the PSF is divided by their transfer function.
     """
 
     def __init__(
@@ -64,11 +65,15 @@ class StampBlur:
             middle - high : middle + high + 1, middle - across : middle + across + 1
         ]
         self._kernel = fft.rfft2(np.roll(kernel, (-high, -across), axis=(0, 1)))
+        height, width = self._fft_shape
+        smoothed = np.outer(np.sinc(fft.fftfreq(height) / subrays), np.sinc(fft.rfftfreq(width) / subrays))
+        self._sharper = self._kernel / smoothed
 
-    def __call__(self, fine: FloatArray) -> FloatArray:
-        """Image (ny, nx) of the window from the flux of each sub-pixel."""
+    def __call__(self, fine: FloatArray, *, integrated: bool) -> FloatArray:
+        """Image (ny, nx) of the window from the flux of each sub-pixel, integrated over it or sampled in its middle."""
         laid = (self._deposit_x @ (self._deposit_y @ fine).T).T
-        blurred = fft.irfft2(fft.rfft2(laid, self._fft_shape) * self._kernel, self._fft_shape)
+        kernel = self._sharper if integrated else self._kernel
+        blurred = fft.irfft2(fft.rfft2(laid, self._fft_shape) * kernel, self._fft_shape)
         k, (ny, nx) = self._outside, self._shape
         return np.asarray(blurred[k : k + ny, k : k + nx])
 
@@ -82,7 +87,7 @@ def lensed_sersic_image(
         scale = observation.pixel_scale
         axes = pixel_centres(nx, scale), pixel_centres(ny, scale)
         blur = StampBlur(spline_coefficients(observation.psf), *axes, scale, _OVERSAMPLING, _OUTSIDE)
-        return blur(render_sersic(profile, blur.x, blur.y, blur.side, lens))
+        return blur(render_sersic(profile, blur.x, blur.y, blur.side, lens), integrated=True)
     geometry = observation.response.geometry
     light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens)
     if lens is None:

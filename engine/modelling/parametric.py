@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -34,12 +35,13 @@ from engine.modelling.image_model import (
     window_round,
 )
 from engine.modelling.point_sources import Detection, candidate_point_sources
+from engine.modelling.psf_error import extended_variance, measured_stamp_error, noise_scale, stamp_variance
 from engine.modelling.starts import (
     Start,
     agn_hypotheses,
     deflector_centre,
     filled_image,
-    ring_radius,
+    ring_radii,
     starts_from_agn,
     starts_from_arc,
 )
@@ -50,15 +52,20 @@ _QUICK_SUBRAYS, _SUBRAYS = 1, 2
 _QUICK_WINDOW = 1.6
 """Half-width of the window of the quick fits in Einstein radii, to which a margin comes."""
 _QUICK_MARGIN = 0.5
-_QUICK_STEPS, _STEPS = 15, 40
-_STAMP_SHIFT = 0.003
-"""Error of a moved PSF stamp, as a shift [arcsec]: a drizzled pixel does not see its light where its centre is."""
-_STAMP_ERROR = 0.005
-"""And as a fraction of the AGN's light."""
+_QUICK_STEPS, _STEPS, _INTEGRATED_STEPS = 15, 40, 15
+_SAMPLED_TOLERANCE, _TOLERANCE = 1e-4, 1e-6
+"""Relative change of cost or parameters at which a fit with derivatives of samples, or of integrals, ends."""
+_HOPELESS = 2.0
+"""Times what is acceptable from which on a fit is not worth the derivatives of integrated light."""
+_SHEAR_SHOWS = 4.0
+"""Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
+
+Dropping a shear that there is biases all of the lens, keeping one that there is not costs a little precision.
+"""
+_RIVAL = 2.0
+"""BIC of a quick fit, of that of the best, up to which another number of AGN images is still a rival."""
 _STAMP_CORRELATION = 2.0
 """Pixels over which the error of a stamp stays the same, as the standard deviation of a Gaussian."""
-_RESPONSE_ERROR = 0.002
-"""The same where the exposures are known: what errors of position leave."""
 _MAX_ELLIPTICITY = 0.6
 _CORRECTIONS = 2
 """Rounds in which the images of deflector and host are corrected by those through the exposures, if these are known."""
@@ -94,9 +101,10 @@ class ParametricFit:
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
     that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
     chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
-    their noise and the error of the PSF, infinite where a pixel was not fitted. ``hosts`` are the posteriors of the
-    host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
-    everything and of the lensed host [e-/s].
+    their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many times
+    what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host with
+    each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of everything and
+    of the lensed host [e-/s].
     """
 
     lens: PowerLawLens
@@ -111,6 +119,7 @@ class ParametricFit:
     chi2: float
     degrees_of_freedom: int
     evaluations: int
+    stamp_error: float
     at_bound: tuple[str, ...]
     model: FloatArray
     arc: FloatArray
@@ -162,12 +171,21 @@ def _bounds(model: ImageModel, start: FloatArray) -> tuple[FloatArray, FloatArra
     return low, high
 
 
-def _minimise(model: ImageModel, start: Start, values: FloatArray, steps: int, tolerance: float) -> _Solution:
+def _minimise(
+    model: ImageModel,
+    start: Start,
+    values: FloatArray,
+    steps: int,
+    tolerance: float,
+    *,
+    integrated: bool = False,
+) -> _Solution:
+    """Least squares; with ``integrated`` the derivatives are those of the integrated light, not of samples."""
     low, high = _bounds(model, values)
     inside = np.clip(values, low + 1e-6, high - 1e-6)
     fit = least_squares(
-        model.residuals, inside, model.jacobian, (low, high), x_scale="jac", xtol=tolerance, ftol=tolerance,
-        max_nfev=steps,
+        model.residuals, inside, partial(model.jacobian, integrated=integrated), (low, high), x_scale="jac",
+        xtol=tolerance, ftol=tolerance, max_nfev=steps,
     )  # fmt: skip
     return _Solution(model, fit.x, 2.0 * float(fit.cost), int(fit.nfev), start)
 
@@ -183,12 +201,12 @@ def _minimise_held(solution: _Solution, values: FloatArray, at: int, held: float
     fit = least_squares(
         lambda free: model.residuals(whole(free)),
         np.clip(np.delete(values, at), low + 1e-6, high - 1e-6),
-        lambda free: np.delete(model.jacobian(whole(free)), at, axis=1),
+        lambda free: np.delete(model.jacobian(whole(free), integrated=True), at, axis=1),
         (low, high),
         x_scale="jac",
-        xtol=1e-4,
-        ftol=1e-5,
-        max_nfev=_STEPS,
+        xtol=_TOLERANCE,
+        ftol=_TOLERANCE,
+        max_nfev=_INTEGRATED_STEPS,
     )
     return _Solution(model, whole(fit.x), 2.0 * float(fit.cost), int(fit.nfev), solution.start)
 
@@ -198,21 +216,6 @@ def _stamp_radius(psf: FloatArray) -> int:
     rows, columns = (np.flatnonzero(np.any(psf != 0, axis=axis)) for axis in (1, 0))
     middle = psf.shape[0] // 2
     return int(min(middle - rows[0], rows[-1] - middle, middle - columns[0], columns[-1] - middle))
-
-
-def _stamp_variance(observation: Observation, agn: Sequence[Detection]) -> FloatArray:
-    """Variance (ny, nx) of what the AGN images put on the pixels but no model of them can predict."""
-    variance = np.zeros(observation.shape)
-    scale = observation.pixel_scale
-    if not agn:
-        return variance
-    light = np.zeros(observation.shape)
-    for found in agn:
-        light += found.flux * observation.point_source(found.x, found.y)
-    if observation.response is not None:
-        return np.asarray((_RESPONSE_ERROR * light) ** 2)
-    steep = sum(np.asarray(slope) ** 2 for slope in np.gradient(light, scale))
-    return np.asarray((_STAMP_ERROR * light) ** 2 + _STAMP_SHIFT**2 * steep)
 
 
 def _refuse(options: dict[str, tuple[object, bool, str]]) -> None:
@@ -243,7 +246,7 @@ def fit_parametric(
     deflector : bool
         Whether the deflector shines: a component that is absent is not built.
     shear : bool, optional
-        Whether the lens has external shear; where None it has where the BIC asks for it.
+        Whether the lens has external shear; where None it has where the fit's differs from none.
     theta_E : float, optional
         Rough Einstein radius [arcsec].
     positions : sequence of (x, y), optional
@@ -262,7 +265,7 @@ def fit_parametric(
     PosteriorError
         No start leads to an acceptable fit; the message says what is wrong with the best.
     """
-    finder = _Finder(observation, deflector=deflector, acceptance=acceptance, priors=priors)
+    finder = _Finder(observation, deflector=deflector, shear=shear, acceptance=acceptance, priors=priors)
     radius = min(observation.shape) * observation.pixel_scale / 2
     _refuse(
         {
@@ -273,9 +276,9 @@ def fit_parametric(
     groups = finder.starts(agn_images, theta_E, positions)
     refusals: list[str] = []
     for wave in (groups, [_varied(group) for group in groups]):
-        for solution in finder.ranked([finder.quick(group) for group in wave], shear=shear is not False):
+        for solution in finder.ranked([finder.quick(group) for group in wave]):
             try:
-                return finder.result(finder.polish(solution, shear=shear), fixed_index)
+                return finder.result(finder.polish(solution), fixed_index)
             except PosteriorError as error:
                 refusals.append(str(error))
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
@@ -305,11 +308,13 @@ class _Finder:
         observation: Observation,
         *,
         deflector: bool,
+        shear: bool | None,
         acceptance: Acceptance,
         priors: Mapping[LensParameterName, ParameterPrior],
     ) -> None:
         self.observation, self.has_deflector, self.acceptance = observation, deflector, acceptance
-        self.priors = priors
+        self.shear, self.may_shear = shear, shear is not False
+        self.priors, self.stamp_error = priors, 1.0
         self.image = filled_image(observation)
         self.noise = np.where(
             observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
@@ -340,8 +345,8 @@ class _Finder:
             if len(agn) >= 2:
                 groups.append(starts_from_agn(agn, self.centre))
             else:
-                rough = theta_E or ring_radius(self.image, self.observation.pixel_scale, self.centre)
-                groups.append(starts_from_arc(rough, self.centre, agn))
+                rough = (theta_E,) if theta_E else ring_radii(self.image, self.observation.pixel_scale, self.centre)
+                groups.append([start for radius in rough for start in starts_from_arc(radius, self.centre, agn)])
         return groups
 
     def _fitted(self, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray[np.bool_]:
@@ -372,9 +377,10 @@ class _Finder:
         window = window_round(
             observation.shape, observation.pixel_scale, self.centre, _QUICK_WINDOW * reach + _QUICK_MARGIN
         )
-        layout = Layout(len(first.agn), self.has_deflector, shear=first.lens.gamma1 != 0.0)
+        # Without it an arc that was sheared ends in one of several false minima, far from the true lens.
+        layout = Layout(len(first.agn), self.has_deflector, shear=self.may_shear or first.lens.gamma1 != 0.0)
         # One noise map for all hypotheses, or their chi^2 could not be compared.
-        sigma = weights_sigma(observation, _stamp_variance(observation, self._candidates(4)))
+        sigma = weights_sigma(observation, stamp_variance(observation, self._candidates(4)))
         model = ImageModel(observation, layout, sigma, window, subrays=_QUICK_SUBRAYS, exact=False)
         if len(group) > 2 * _ARC_STARTS:
             group = self._best_linear(model, group)
@@ -404,36 +410,69 @@ class _Finder:
                 break
         return chosen
 
-    def ranked(self, groups: list[list[_Solution]], *, shear: bool) -> list[_Solution]:
+    def ranked(self, groups: list[list[_Solution]]) -> list[_Solution]:
         """The two solutions to go on with, the better one first.
 
-        A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so solutions with and
-        without AGN are compared as fits of full accuracy, with ``shear`` where there may be some, on one noise map.
+        A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so the best quick fits with
+        each number of them that is not out of the question, and that without, are compared as fits of full accuracy
+        on one noise map.
         """
         best = sorted((min(group, key=_information) for group in groups if group), key=_information)
         if len(best) == 1:
-            return sorted(groups[0], key=_information)[:2]
-        rivals = [next((s for s in best if bool(s.model.layout.n_agn) is with_agn), None) for with_agn in (True, False)]
-        chosen = [solution for solution in rivals if solution is not None]
+            return sorted((solution for group in groups for solution in group), key=_information)[:2]
+        with_agn = [solution for solution in best if solution.model.layout.n_agn]
+        chosen = [solution for solution in best if not solution.model.layout.n_agn]
+        chosen += [s for s in with_agn if _information(s) < _RIVAL * _information(with_agn[0])]
         if len(chosen) < 2:
             return best[:2]
-        sigma = self._sigma(chosen[0])
-        rated: list[tuple[float, int]] = []
-        for k, solution in enumerate(chosen):
-            layout = replace(solution.model.layout, shear=shear)
-            values = _with_shear(solution.values, solution.model.layout, shear=shear)
-            full = _minimise(self._model(layout, sigma), solution.start, values, _STEPS, 1e-4)
-            self.evaluations += full.evaluations
-            rated.append((_information(full), k))
-        return [chosen[k] for _, k in sorted(rated)]
+        sigma = self._sigma(with_agn[0] if with_agn else chosen[0])
+        full = [self._full(solution, sigma, shear=self.may_shear) for solution in chosen]
+        return sorted(full, key=_information)[:2]
 
-    def _sigma(self, quick: _Solution) -> FloatArray:
-        """Standard deviation of the pixels of the final fit, with the error of the AGN as they were quickly fitted."""
-        values, layout = quick.values, quick.model.layout
-        agn = _fitted_agn(layout, values, quick.model.amplitudes(values)[0], quick.start.agn)
-        sigma = weights_sigma(self.observation, _stamp_variance(self.observation, agn))
+    def _full(self, solution: _Solution, sigma: FloatArray, *, shear: bool) -> _Solution:
+        """The fit of the whole image that begins where another ended."""
+        layout = solution.model.layout
+        values = _with_shear(solution.values, layout, shear=shear)
+        model = self._model(replace(layout, shear=shear), sigma)
+        sampled = _minimise(model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE)
+        self.evaluations += sampled.evaluations
+        if sampled.cost > _HOPELESS * self.acceptance.chi2_per_dof * model.pixels:
+            return sampled
+        found = _minimise(model, solution.start, sampled.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
+        self.evaluations += found.evaluations
+        return found
+
+    def _variances(self, solution: _Solution) -> tuple[FloatArray, FloatArray]:
+        """Variance (ny, nx) allowed for the stamps of the AGN images as they were fitted, and for extended light."""
+        values, layout = solution.values, solution.model.layout
+        amplitudes, _, columns = solution.model.amplitudes(values)
+        stamps = stamp_variance(self.observation, _fitted_agn(layout, values, amplitudes, solution.start.agn))
+        extended = slice(layout.n_agn, -1)
+        light = solution.model.unwhitened(columns[:, extended], amplitudes[extended])
+        return stamps, extended_variance(self.observation, light)
+
+    def _sigma(self, solution: _Solution) -> FloatArray:
+        """Standard deviation of the pixels of the final fit, the PSF's errors included; infinite where not fitted."""
+        values, layout = solution.values, solution.model.layout
+        stamps, extended = self._variances(solution)
+        sigma = weights_sigma(self.observation, self.stamp_error**2 * stamps + extended)
+        agn = _fitted_agn(layout, values, solution.model.amplitudes(values)[0], solution.start.agn)
         sigma[~self._fitted(lens_of(values[layout.lens_slice]), agn)] = np.inf
         return sigma
+
+    def _measured_stamp_error(self, solution: _Solution) -> float:
+        """Error of the AGN's stamps in units of what is allowed for, as the residuals of a full fit have it."""
+        model, values, layout = solution.model, solution.values, solution.model.layout
+        if not layout.n_agn or self.observation.response is not None:
+            return 1.0
+        _, rest, _ = model.amplitudes(values)
+        counted = np.isfinite(model.sigma)
+        residual = rest.reshape(self.observation.shape) * np.where(counted, model.sigma, 0.0)
+        stamps, extended = self._variances(solution)
+        noise = weights_sigma(self.observation)
+        scale = noise_scale(self.observation, residual, model.sigma, lens_of(values[layout.lens_slice]))
+        others = np.where(counted, (scale * noise) ** 2 + extended, np.inf)
+        return measured_stamp_error(residual, stamps, others)
 
     def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
         ny, nx = self.observation.shape
@@ -442,30 +481,28 @@ class _Finder:
             self.observation, layout, sigma, whole, subrays=_SUBRAYS, exact=True, priors=self.priors
         )  # fmt: skip
 
-    def polish(self, quick: _Solution, *, shear: bool | None) -> _Solution:
-        """The fit of the whole image from a quick one; with shear where it is wanted, or is worth its parameters."""
-        values, layout = quick.values, quick.model.layout
-        sigma = self._sigma(quick)
-
-        def model(with_shear: bool) -> ImageModel:
-            return self._model(replace(layout, shear=with_shear), sigma)
-
-        if shear:
-            best = _minimise(model(True), quick.start, _with_shear(values, layout, shear=True), _STEPS, 1e-6)
-        else:
-            best = _minimise(model(False), quick.start, _with_shear(values, layout, shear=False), _STEPS, 1e-6)
-            if shear is None:
-                beside = _with_shear(best.values, best.model.layout, shear=True)
-                other = _minimise(model(True), quick.start, beside, _STEPS, 1e-6)
-                self.evaluations += other.evaluations
-                if best.cost - other.cost > 2.0 * math.log(best.model.pixels):
-                    best = other
-        self.evaluations += best.evaluations
+    def polish(self, solution: _Solution) -> _Solution:
+        """The fit of the whole image from another one; with shear where it is wanted, or is worth its parameters."""
+        best = self._full(solution, self._sigma(solution), shear=self.may_shear)
+        error = self._measured_stamp_error(best)
+        if error != self.stamp_error:
+            self.stamp_error = error
+            best = self._full(best, self._sigma(best), shear=self.may_shear)
+        if self.shear is None and not self._shear_shows(best):
+            best = self._full(best, best.model.sigma, shear=False)
         for _ in range(_CORRECTIONS if self.observation.response is not None else 0):
             best.model.correct(best.values)
-            best = _minimise(best.model, best.start, best.values, _STEPS, 1e-6)
+            best = _minimise(best.model, best.start, best.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
             self.evaluations += best.evaluations
         return best
+
+    def _shear_shows(self, solution: _Solution) -> bool:
+        """Whether a fit's shear differs from none by more than its covariance lets expect."""
+        jacobian, _ = solution.model.full_jacobian(solution.values)
+        covariance = _covariance(jacobian, self._shared(solution.model, jacobian[: solution.model.data.size]))
+        where = slice(solution.model.layout.lens_slice.stop - 2, solution.model.layout.lens_slice.stop)
+        shear = solution.values[where]
+        return bool(shear @ np.linalg.solve(covariance[where, where], shear) > _SHEAR_SHOWS)
 
     def _shared(self, model: ImageModel, jacobian: FloatArray) -> FloatArray:
         """J^T (C - diag C) J of the whitened Jacobian: what pixels share of their noise and of the stamps' error."""
@@ -563,6 +600,7 @@ class _Finder:
             chi2=chi2,
             degrees_of_freedom=freedom,
             evaluations=self.evaluations,
+            stamp_error=self.stamp_error,
             at_bound=_at_bound(solution),
             model=(columns @ amplitudes).reshape(shape),
             arc=(columns[:, -2] * flux).reshape(shape),

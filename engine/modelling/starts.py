@@ -28,6 +28,10 @@ _ARC_ANGLES = 4
 _ARC_OFFSETS = 5
 _ARC_REACH = 0.25
 _DOUBLE_AXIS_RATIO = 0.75
+_ELLIPSES, _ELLIPSE_ANGLES = (0.85, 0.7, 0.55), 6
+"""Axis ratios of a deflector that is taken off an image, and along how many directions they are tried."""
+_SECOND_RING = 0.2
+"""Excess, of that of the first, from which on a second radius counts."""
 
 
 @dataclass(frozen=True)
@@ -78,25 +82,51 @@ def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, floa
     )
 
 
-def ring_radius(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> float:
-    """Radius [arcsec] at which light that is not the deflector's stands out most: a rough Einstein radius.
+def without_deflector(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> FloatArray:
+    """The image less the median over ellipses round ``centre``, of the shape that leaves the least light (L1 norm)."""
+    y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
+    x, y = x - centre[0], y - centre[1]
+    near = np.hypot(x, y) < 0.5 * min(image.shape) * pixel_scale
+    shapes = [(1.0, 0.0), *((q, math.pi * k / _ELLIPSE_ANGLES) for q in _ELLIPSES for k in range(_ELLIPSE_ANGLES))]
+    best, least = image, math.inf
+    for q, phi in shapes:
+        along, across = math.cos(phi) * x + math.sin(phi) * y, math.cos(phi) * y - math.sin(phi) * x
+        ring = np.rint(np.sqrt(q * along**2 + across**2 / q) / pixel_scale).astype(int)
+        medians = np.asarray(ndimage.median(image, labels=ring, index=np.arange(ring.max() + 1)))
+        rest = image - medians[ring]
+        left = float(np.abs(rest[near]).sum())
+        if left < least:
+            best, least = rest, left
+    return best
 
-    On each circle round the deflector the excess over the lower quartile, which the deflector alone would fill, is
-    summed. Circles within three pixels are the deflector's own.
+
+def ring_radii(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> tuple[float, ...]:
+    """Radii [arcsec] at which light that is not the deflector's stands out: rough Einstein radii, the likeliest first.
+
+    On each circle round the deflector the excess over the lower quartile is summed. A bright flat deflector exceeds it
+    more than a faint arc does, so that it is taken off first, by ellipses. The images of a source that is not behind
+    the deflector's middle stand out at two radii, with the Einstein radius half way between. Circles within three
+    pixels are the deflector's own.
     """
     y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
     ring = np.rint(np.hypot(x - centre[0], y - centre[1]) / pixel_scale).astype(int)
     last = int(min(image.shape) // 2)
     excess = np.zeros(last)
-    smooth = ndimage.gaussian_filter(image, 1.0)
+    smooth = ndimage.gaussian_filter(without_deflector(image, pixel_scale, centre), 1.0)
     for radius in range(3, last):
         on = smooth[ring == radius]
         excess[radius] = float(np.mean(on - np.percentile(on, 25))) * math.sqrt(radius)
     excess = ndimage.gaussian_filter1d(excess, 1.5)
-    # The innermost circles hold the deflector's ellipticity: the first true maximum, not the edge.
+    # The innermost circles hold what is left of the deflector: true maxima, not the edge.
     peaks = [k for k in range(4, last - 1) if excess[k - 1] < excess[k] >= excess[k + 1]]
-    best = max(peaks, key=lambda k: excess[k]) if peaks else int(np.argmax(excess))
-    return best * pixel_scale
+    if not peaks:
+        return (int(np.argmax(excess)) * pixel_scale,)
+    first, *others = sorted(peaks, key=lambda k: -excess[k])
+    radii = [first * pixel_scale]
+    if others and excess[others[0]] > _SECOND_RING * excess[first]:
+        second = others[0] * pixel_scale
+        radii += [0.5 * (radii[0] + second), second]
+    return tuple(radii)
 
 
 def agn_hypotheses(

@@ -6,14 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine.conventions import rate_to_magnitude
+from engine.conventions import pixel_centres, rate_to_magnitude
 from engine.errors import ObservationError, PosteriorError
+from engine.imaging.blurring import spline_coefficients
+from engine.imaging.extended import StampBlur
+from engine.imaging.observation import Observation
 from engine.inversion.problem import CORE_BOOST, prepare_problem, ring_mask
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
+from engine.light.rendering import render_sersic
+from engine.light.sersic import SersicProfile, surface_brightness
+from engine.modelling.image_model import ImageModel, Layout, lens_of, sersic_of
 from engine.modelling.lens_start import lens_from_positions
 from engine.modelling.parametric import ParametricFit, fit_parametric
 from engine.modelling.point_sources import find_point_sources
+from engine.modelling.psf_error import measured_stamp_error
+from engine.modelling.starts import ring_radii
 from engine.scene import Scene
 from engine.simulation import Simulation
 from engine.spec import Analysis
@@ -130,3 +138,73 @@ def test_a_ring_without_valid_pixels_is_refused(simulation: Simulation, fit: Par
     corner[0, 0] = True
     with pytest.raises(ObservationError, match="mask"):
         prepare_problem(replace(observation, valid=corner), fit, Analysis(noise_treatment="diagonal"))
+
+
+def _lensed(observation: Observation, *, shear: bool = False) -> tuple[ImageModel, np.ndarray]:
+    """A model of a host's arc and a deflector, without AGN, on an image of its own; and its parameters."""
+    layout = Layout(0, deflector=True, shear=shear)
+    whole = (slice(0, observation.shape[0]), slice(0, observation.shape[1]))
+    model = ImageModel(observation, layout, observation.noise, whole, subrays=2, exact=True)
+    deflector = [math.log(0.9), 3.0, 0.05, 0.02, 0.0, 0.0]
+    lens = [1.1, 0.09, 0.02, 1.95, 0.0, 0.0, *([0.03, -0.02] if shear else [])]
+    return model, np.array([*deflector, *lens, math.log(0.25), 2.5, 0.1, 0.0, 0.03, 0.02])
+
+
+@pytest.fixture(scope="module")
+def stamped(simulation: Simulation) -> Observation:
+    """Nothing but noise map and stamp of the simulation: an image of 61 x 61 pixels."""
+    psf = simulation.observation.psf
+    noise = np.full((61, 61), 2e-3)
+    return Observation(np.zeros(noise.shape), noise, psf / psf.sum(), 0.08, 25.9463)
+
+
+def test_the_smoothing_by_sub_rays_is_not_counted_beside_that_of_the_psf(stamped: Observation) -> None:
+    model, values = _lensed(stamped)
+    layout = model.layout
+    host, lens = sersic_of(values[layout.host_slice]), lens_of(values[layout.lens_slice])
+    arc = model.unwhitened(model.columns(values)[:, layout.amplitudes - 2, None], np.ones(1))
+    # Ten times as many rays, whose own smoothing is a hundredth.
+    x = pixel_centres(61, 0.08)
+    fine = StampBlur(spline_coefficients(stamped.psf), x, x, 0.08, 20, 0)
+    truth = fine(render_sersic(host, fine.x, fine.y, fine.side, lens), integrated=True)
+    assert arc.sum() == pytest.approx(truth.sum(), rel=1e-3)
+    # What two rays a pixel leave is 0.0012 of the light; the rays' own smoothing, if it stays, makes it 0.0034.
+    assert np.linalg.norm(arc - truth) < 2e-3 * np.linalg.norm(truth)
+
+
+def test_derivatives_of_the_final_fit_are_those_of_its_light(stamped: Observation) -> None:
+    model, values = _lensed(stamped, shear=True)
+    columns = model.columns(values)
+    model.data = columns @ np.array([30.0, 2.0, 0.0]) + np.random.default_rng(0).normal(size=columns.shape[0])
+    exact = model.jacobian(values, integrated=True)
+    for k in range(values.size):
+        step = np.zeros(values.size)
+        step[k] = 3e-4
+        slope = (model.residuals(values + step) - model.residuals(values - step)) / 6e-4
+        # Kaufman's form leaves out what is proportional to the residuals, here noise.
+        assert np.linalg.norm(exact[:, k] - slope) < 0.03 * np.linalg.norm(slope), k
+
+
+def test_a_faint_ring_is_found_round_a_bright_flat_deflector() -> None:
+    x, y = np.meshgrid(pixel_centres(83, 0.08), pixel_centres(83, 0.08))
+    flat = SersicProfile(2500.0, 0.85, 3.8, 0.68, 1.4, 0.0, 0.0)
+    ring = 0.5 * np.exp(-0.5 * ((np.hypot(x, y) - 1.3) / 0.12) ** 2) * (1.0 + np.cos(np.arctan2(y, x) - 1.0))
+    image = surface_brightness(flat, x, y) * 0.08**2 + ring
+    assert any(abs(radius / 1.3 - 1.0) < 0.15 for radius in ring_radii(image, 0.08, (0.0, 0.0)))
+
+
+@pytest.mark.parametrize("error", [0.7, 1.0, 2.5])
+def test_the_error_of_a_stamp_is_read_off_the_residuals(error: float) -> None:
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0))
+    stamps, others = 50.0 * np.exp(-0.5 * (x**2 + y**2) / 16.0), np.ones(x.shape)
+    residual = rng.normal(size=x.shape) * np.sqrt(others + error**2 * stamps)
+    # 250 pixels: their mean square is known to 9 %, its root to half of that.
+    assert measured_stamp_error(residual, stamps, others) == pytest.approx(error, rel=0.15)
+
+
+def test_residuals_that_no_stamp_explains_change_its_error_by_no_more_than_is_allowed() -> None:
+    stamps, others = np.full((9, 9), 10.0), np.ones((9, 9))
+    assert measured_stamp_error(np.full((9, 9), 1e3), stamps, others) == 5.0
+    assert measured_stamp_error(np.zeros((9, 9)), stamps, others) == 0.5
+    assert measured_stamp_error(np.ones((9, 9)), 0.1 * others, others) == 1.0
