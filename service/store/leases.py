@@ -11,8 +11,9 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, exists, func, select, update
 
+from service.store.bulk import insert_rows
 from service.store.pace import recent
 from service.store.states import CANCEL, OPEN_STATES, PAUSE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
@@ -101,8 +102,9 @@ def end_attempts(
 ) -> None:
     """Write down how the attempts of leased runs ended; rows are only ever added."""
     if rows:
-        connection.execute(
-            insert(attempt),
+        insert_rows(
+            connection,
+            attempt,
             [
                 {
                     "run_id": row.id,
@@ -188,7 +190,7 @@ def new_event(grid_id: str, kind: str, now: datetime, run_id: str | None = None,
 
 def add_events(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Add to the outbox, in the transaction of the changes that the events report."""
-    connection.execute(insert(event), rows)
+    insert_rows(connection, event, rows)
 
 
 def add_event(

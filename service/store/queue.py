@@ -9,10 +9,11 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, insert, literal_column, select, true
+from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, literal_column, select, true
 
 from service.identifiers import new_token, utc_now
 from service.payload import ResultPayload
+from service.store.bulk import insert_rows
 from service.store.database import Database
 from service.store.leadership import require_generation
 from service.store.leases import (
@@ -169,7 +170,7 @@ class RunQueue:
         asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
         inputs = {row.id: row.inputs for row in asked}
         stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
-        connection.execute(insert(result), stored)
+        insert_rows(connection, result, stored)
         add_to_sums(connection, stored)
         add_events(
             connection,

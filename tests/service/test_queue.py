@@ -12,6 +12,7 @@ import pytest
 from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 
+from service.payload import QuantityPayload
 from service.store.database import Database
 from service.store.grids import GridStore, KeyReusedError, NotFoundError
 from service.store.leadership import Leadership, LeadershipLostError
@@ -129,6 +130,26 @@ def test_a_stored_run_is_done_and_has_one_result_with_its_inputs(
     assert (row.system, row.camera, row.n, row.magnitude, row.seed) == ("HE0435", "WFC3-IR_F160W", 2.0, 20.5, 0)
     grid = grids.grid(grid_id)
     assert (grid.state, grid.counts.done, grid.progress, grid.eta_seconds) == (GridState.DONE, 1, 1.0, 0.0)
+
+
+def test_results_with_other_lens_parameters_are_stored_together(
+    database: Database, grids: GridStore, queue: RunQueue, generation: int
+) -> None:
+    """One system has an external shear and another has none; their runs may end in the same moment."""
+    submit(grids, 4)
+    leases = queue.claim(generation, 4)
+    with_shear = {"gamma1": QuantityPayload(mean=0.01, sd=0.001, truth=0.02)}
+    for pair, sheared in ((leases[:2], 0), (leases[2:], 1)):
+        payloads = [result_of(lease) for lease in pair]
+        lens = {**payloads[sheared].lens, **with_shear}
+        payloads[sheared] = payloads[sheared].model_copy(update={"lens": lens})
+        queue.store_all(list(zip(pair, payloads, strict=True)))
+    found = [grids.run(lease.run_id).result for lease in leases]
+    assert [result is not None and "gamma1" in result.lens for result in found] == [True, False, False, True]
+    assert found[0] is not None
+    assert found[3] is not None
+    assert found[0].lens["gamma1"].model_dump() == found[3].lens["gamma1"].model_dump()
+    assert found[0].lens["gamma1"].truth == 0.02
 
 
 def test_a_result_comes_too_late_once_another_was_stored(
