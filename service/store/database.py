@@ -9,10 +9,24 @@ from typing import Any
 from pydantic_core import from_json, to_json
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import make_url
+from sqlalchemy.exc import InterfaceError, InternalError, OperationalError
 from sqlalchemy.pool import NullPool
 
 BUSY_TIMEOUT_MS = 30_000
-CONNECT_TIMEOUT_S = 5
+_NETWORK = {
+    "connect_timeout": 5,
+    # A server whose machine is gone says nothing more: after half a minute without an answer to what was sent, or to
+    # three questions whether it is there, it is taken for away. The system's own patience is up to two hours.
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 30_000,
+}
+AWAY = (OperationalError, InterfaceError, InternalError)
+"""The database cannot be written now: none of it is the fault of what was to be written, and a later try may succeed.
+
+The last is what a server says that has become a read-only replica.
+"""
 
 
 class Database:
@@ -32,7 +46,8 @@ class Database:
         if self.is_sqlite:
             options["connect_args"] = {"timeout": BUSY_TIMEOUT_MS / 1000}
         else:
-            options["connect_args"] = {"connect_timeout": CONNECT_TIMEOUT_S}
+            # What the URL says itself goes before.
+            options["connect_args"] = {name: value for name, value in _NETWORK.items() if name not in self.url.query}
         self.engine: Engine = create_engine(self.url, json_serializer=_to_json, json_deserializer=from_json, **options)
         if self.is_sqlite:
             event.listen(self.engine, "connect", _prepare_sqlite)

@@ -18,6 +18,9 @@ from service.store.pace import recent
 from service.store.states import CANCEL, OPEN_STATES, PAUSE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
 
+AT_ONCE = 5000
+"""Runs that one statement may name: databases take so many parameters and no more."""
+
 
 class Outcome(StrEnum):
     """How an attempt ended; only ``error``, ``worker_lost`` and ``deadline`` count against the run."""
@@ -137,14 +140,31 @@ def requeue(
     their own. The ids of those that were not cancelled come back.
     """
     rows = leased(connection, where)
-    end_attempts(connection, rows, outcome, now, detail=detail)
-    ids = [row.id for row in rows]
     values: dict[str, Any] = {} if not_before is None else {"not_before": not_before}
     if suspect:
         values["suspect"] = True
+    given = []
+    for first in range(0, len(rows), AT_ONCE):
+        some = rows[first : first + AT_ONCE]
+        end_attempts(connection, some, outcome, now, detail=detail)
+        given += _requeue(connection, some, outcome, now, values)
+    return given
+
+
+def _requeue(
+    connection: Connection,
+    rows: Sequence[Row[*tuple[Any, ...]]],
+    outcome: Outcome,
+    now: datetime,
+    values: dict[str, Any],
+) -> list[str]:
+    ids = [row.id for row in rows]
     moved = move(connection, REQUEUE, run.c.id.in_(ids), **values)
-    for row in rows:
-        add_event(connection, row.grid_id, "run_requeued", now, row.id, outcome=outcome, attempt=row.attempt)
+    told = {"outcome": outcome}
+    add_events(
+        connection,
+        [new_event(row.grid_id, "run_requeued", now, row.id, **told, attempt=row.attempt) for row in rows],
+    )
     cancelled_grids = select(grid.c.id).where(grid.c.cancelled_at.is_not(None))
     dropped = move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now)
     if dropped:
