@@ -54,7 +54,7 @@ def dispatch(settings: Settings) -> int:
 
 
 def _dispatch(settings: Settings, metrics: DispatcherMetrics, stop: Event) -> int:
-    database = Database(settings.database)
+    database = Database(settings.database, asked_first=False)
     leadership = Leadership(database, settings.leader_ttl_s)
     try:
         generation = wait_to_lead(leadership, settings, stop)

@@ -35,14 +35,15 @@ class Database:
     On SQLite ``write`` begins IMMEDIATE: a transaction that reads first and then wants to write fails at once when
     another writer was there in between, whatever the busy timeout; one that waits for its turn at the beginning
     does not. ``read`` stays deferred, so that readers never wait (the journal is a WAL). ``foreign_keys`` is only ever
-    turned off by migrations, which replace tables that others refer to.
+    turned off by migrations, which replace tables that others refer to. A connection is ``asked_first`` whether it is
+    still there, except by who tries again anyway.
     """
 
-    def __init__(self, url: str, *, pooled: bool = True, foreign_keys: bool = True) -> None:
+    def __init__(self, url: str, *, pooled: bool = True, asked_first: bool = True, foreign_keys: bool = True) -> None:
         self.url = make_url(url)
         if self.url.drivername in {"postgresql", "postgres"}:
             self.url = self.url.set(drivername="postgresql+psycopg")
-        options: dict[str, Any] = {"pool_pre_ping": True} if pooled else {"poolclass": NullPool}
+        options: dict[str, Any] = {"pool_pre_ping": asked_first} if pooled else {"poolclass": NullPool}
         if self.is_sqlite:
             options["connect_args"] = {"timeout": BUSY_TIMEOUT_MS / 1000}
         else:

@@ -31,7 +31,7 @@ from service.store.leases import (
     requeue,
 )
 from service.store.results import result_row
-from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move
+from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move, moving
 from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
 
@@ -110,31 +110,24 @@ class RunQueue:
             # Materialised, or PostgreSQL may run it again for each row and lock more than ``limit``.
             .prefix_with("MATERIALIZED", dialect="postgresql")
         )
+        taken = moving(
+            CLAIM,
+            run.c.id.in_(select(picked.c.id)),
+            token=token,
+            generation=generation,
+            leased_at=now,
+            attempt=run.c.attempt + 1,
+        ).returning(*_CLAIMED)
         with self._database.write() as connection:
             require_generation(connection, generation)
-            ids = move(
-                connection,
-                CLAIM,
-                run.c.id.in_(select(picked.c.id)),
-                token=token,
-                generation=generation,
-                leased_at=now,
-                attempt=run.c.attempt + 1,
+            rows = connection.execute(taken).all()
+        return [
+            Lease(
+                row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
+                row.engine_digest, row.suspect,
             )
-            columns = (run.c.id, run.c.grid_id, run.c.attempt, run.c.digest, run.c.spec, run.c.suspect)
-            claimed = (
-                select(*columns, grid.c.engine_digest)
-                .join(grid, grid.c.id == run.c.grid_id)
-                .where(run.c.id.in_(ids))
-                .order_by(run.c.not_before, run.c.id)
-            )
-            return [
-                Lease(
-                    row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
-                    row.engine_digest, row.suspect,
-                )
-                for row in connection.execute(claimed)
-            ]  # fmt: skip
+            for row in sorted(rows, key=lambda row: (row.not_before, row.id))
+        ]  # fmt: skip
 
     def store(self, lease: Lease, payload: ResultPayload) -> Stored:
         """Store a result if the lease is still valid.
@@ -322,6 +315,20 @@ class RunQueue:
             detail = {"attempt": lease.attempt, "same": same}
             add_event(connection, lease.grid_id, "stale_result", now, lease.run_id, **detail)
         return Stored.STALE_SAME if same else Stored.STALE_OTHER
+
+
+_ENGINE = select(grid.c.engine_digest).where(grid.c.id == run.c.grid_id).correlate(run).scalar_subquery()
+# All by the statement that claims: each one more is another wait for the server's turn.
+_CLAIMED = (
+    run.c.id,
+    run.c.grid_id,
+    run.c.attempt,
+    run.c.digest,
+    run.c.spec,
+    run.c.suspect,
+    run.c.not_before,
+    _ENGINE.label("engine_digest"),
+)
 
 
 def _ready(now: datetime, engine: str | None, suspects: bool) -> ColumnElement[bool]:
