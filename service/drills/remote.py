@@ -105,7 +105,7 @@ class TwoWorkers(Drill):
                 service.wait_ready(workers, timeout_s=180)
                 spent, waited = _spent(service), _waited(service)
                 grid = service.client.submit(self._request(workers))
-                service.watch(grid.id, timeout_s=3600)
+                service.watch(grid.id, timeout_s=3600, every_s=1.0)
                 spent = {name: seconds - spent[name] for name, seconds in _spent(service).items()}
                 waited = (_waited(service) - waited) / workers
                 return Worked(working_time(service, grid.id), spent, waited, records(service, grid.id))

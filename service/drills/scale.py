@@ -166,7 +166,7 @@ class Overhead(Drill):
         with installation(ground.folder / "drill", settings) as service:
             service.wait_ready(self.workers)
             grid = service.client.submit(body(self.runs))
-            service.watch(grid.id)
+            service.watch(grid.id, every_s=1.0)
             took = working_time(service, grid.id)
             found = records(service, grid.id)
         alone = self.sleep_s * self.runs / self.workers
