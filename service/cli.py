@@ -250,7 +250,12 @@ def drill(
     name: Annotated[str, typer.Argument(help="One of those that ``list`` shows")],
     size: Annotated[list[str] | None, typer.Argument(help="Sizes to change, as runs=100")] = None,
     small: Annotated[bool, typer.Option("--small", help="Sizes that take seconds")] = False,
-    database_url: Annotated[str | None, typer.Option("--database", help="An empty database instead of SQLite")] = None,
+    database_url: Annotated[
+        str | None,
+        typer.Option(
+            "--database", help="URL of an empty database instead of SQLite, or postgresql: a server of its own"
+        ),
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Where to write the report")] = None,
 ) -> None:
     """Put a promise of the service to the test, on a service of its own; exit code 1 if it does not hold."""

@@ -17,6 +17,7 @@ def spare_collector() -> None:
     A summary of a thousand inputs makes twenty thousand objects, and every few hundred of them the collector would look
     through all of the engine again: half of the time that the answer takes.
     """
+    gc.enable()
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)

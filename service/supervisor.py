@@ -118,10 +118,10 @@ class Supervisor:
         code = child.process.wait()
         child.process = None
         if time.monotonic() - child.started > _STEADY_S:
-            child.delay = _FIRST_DELAY_S
+            child.delay = 0.0
         _LOG.warning("%s ended with %d; next start in %.1f s", child.module, code, child.delay)
         child.due = time.monotonic() + child.delay
-        child.delay = min(2 * child.delay, _MAX_DELAY_S)
+        child.delay = min(max(2 * child.delay, _FIRST_DELAY_S), _MAX_DELAY_S)
 
     def _end_all(self) -> None:
         running = [child.process for child in self._children if child.process is not None]

@@ -18,6 +18,7 @@ from starlette.exceptions import HTTPException
 from engine import SpecError, field_steps, spec_error
 from service.requests import TooManyRunsError
 from service.schemas import Place, Problem
+from service.store.database import AWAY
 from service.store.grids import KeyReusedError, NotFoundError
 
 MEDIA_TYPE = "application/problem+json"
@@ -138,7 +139,7 @@ def _http(request: Request, error: Exception) -> JSONResponse:
 
 def _database(request: Request, error: Exception) -> JSONResponse:
     # Programming errors and broken constraints are ours; everything else means that the database cannot serve now.
-    if isinstance(error, DBAPIError) and type(error).__name__ not in {"OperationalError", "InterfaceError"}:
+    if isinstance(error, DBAPIError) and not isinstance(error, AWAY):
         return _unexpected(request, error)
     _LOG.error("the database is not available: %s", error)
     return problem(request, 503, "the database is not available", headers={"Retry-After": "5"})

@@ -1,17 +1,20 @@
 """``python -m service.dispatcher``: the dispatcher process, as the supervisor starts it."""
 
+import gc
+import os
 import sys
 
 # Dask's workers import this module again when they are started; only the process itself dispatches.
 if __name__ == "__main__":
-    from service.settings import Settings
-
-    settings = Settings()
-    if settings.kind_of_cluster == "local":
+    # Until everything is loaded; dispatch() turns it on again.
+    gc.disable()
+    # Asked for in plain, because to load what reads settings takes a tenth of the time that workers wait for.
+    if os.environ.get("HOSTLENS_CLUSTER", "local") == "local" and "HOSTLENS_SCHEDULER_ADDRESS" not in os.environ:
         from service.dispatcher.nursery import open_nursery
 
         # Before all else, so that it loads while this process does; without this, dispatch() opens it.
         open_nursery()
     from service.dispatcher.process import dispatch
+    from service.settings import Settings
 
-    sys.exit(dispatch(settings))
+    sys.exit(dispatch(Settings()))

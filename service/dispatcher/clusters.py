@@ -42,6 +42,8 @@ def dask_config(settings: Settings) -> dict[str, Any]:
         "distributed.admin.tick.interval": "500ms",
         "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.profile.enabled": False,
+        # For its own developers it keeps the last thousand messages of each connection, with all the runs in them.
+        "distributed.admin.low-level-log-length": 10,
         "temporary-directory": settings.scratch,
     }
 

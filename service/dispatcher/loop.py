@@ -16,7 +16,6 @@ from threading import Event
 from typing import Any
 
 from distributed import KilledWorker
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
 from service import logs
 from service.dispatcher.ahead import Ahead
@@ -28,6 +27,7 @@ from service.dispatcher.placement import Slots
 from service.dispatcher.pool import Pool, Worker, is_lost
 from service.payload import ResultPayload
 from service.settings import Settings
+from service.store.database import AWAY
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored
 
@@ -38,6 +38,7 @@ _MAX_BACK_OFF_S = 10.0
 _EMPTY_LOOKS = 3
 _GONE_S = 1.0
 _NO_WINDOW = 1_000_000
+_STORE_AT_ONCE = 1000
 _BRIEF_S = 10.0
 """Where runs take less, the next are claimed before a worker is free: it waits 30 ms for the database otherwise."""
 
@@ -140,7 +141,7 @@ class Dispatcher:
         try:
             step()
             self._back_off = 0.0
-        except (OperationalError, InterfaceError) as error:
+        except AWAY as error:
             self._back_off = min(max(2 * self._back_off, 0.2), _MAX_BACK_OFF_S)
             _LOG.warning("the database is away, next try in %.1f s: %s", self._back_off, error.orig)
             wait(self._back_off)
@@ -157,6 +158,7 @@ class Dispatcher:
         self._write_endings()
         if self._is_due("cancel", _LOOK_S) and (self._flights or len(self._ahead)):
             self._stop_cancelled()
+            self._hold_paused()
         if self._is_due("reconcile", self._settings.reconcile_s):
             self._reconcile()
 
@@ -250,7 +252,8 @@ class Dispatcher:
                 self._land(task, results)
             tasks = self._ended(0.0)
         if results:
-            self._endings.append(partial(self._store, results))
+            for first in range(0, len(results), _STORE_AT_ONCE):
+                self._endings.append(partial(self._store, results[first : first + _STORE_AT_ONCE]))
 
     def _ended(self, wait_s: float) -> list[str]:
         """Dask tasks that have ended since the last look, after a wait for the first of them."""
@@ -323,9 +326,9 @@ class Dispatcher:
     def _store(self, results: list[tuple[Lease, ResultPayload]]) -> None:
         try:
             stored = self._queue.store_all(results)
-        except (OperationalError, InterfaceError):
+        except AWAY:
             raise
-        except DBAPIError as error:
+        except Exception as error:  # noqa: BLE001 - no result may end the dispatcher, whatever is wrong with it
             if len(results) > 1:
                 # Nothing was stored; each is tried alone, so that one that is refused keeps no other out.
                 self._endings.extend(partial(self._store, [one]) for one in results)
@@ -396,12 +399,18 @@ class Dispatcher:
         cancelled = set(self._queue.to_cancel(self._generation))
         stopped = [key for key, flight in self._flights.items() if flight.lease.run_id in cancelled]
         for key in stopped:
-            # First the database, then the worker: whatever comes back now finds its lease gone.
+            # First the database, then the worker: whatever comes back now finds its lease gone. One by one: should the
+            # database go away in between, the next look would not find those that were cancelled before.
             self._queue.cancel_leased(self._flights[key].lease)
-        self._stop_workers_of([self._remove(key) for key in stopped])
+            self._stop_workers_of([self._remove(key)])
         for lease in [lease for lease in self._ahead if lease.run_id in cancelled]:
             self._queue.cancel_leased(lease)
         self._ahead.take_where(lambda lease: lease.run_id in cancelled)
+
+    def _hold_paused(self) -> None:
+        """Give back what was claimed ahead of grids that have been paused since: it has not been started."""
+        paused = set(self._queue.to_hold(self._generation)) if len(self._ahead) else set()
+        self._give_back(self._ahead.take_where(lambda lease: lease.run_id in paused), Outcome.HANDED_BACK)
 
     def _stop_workers_of(self, flights: list[Flight]) -> None:
         """End what no longer has a lease; runs beside it on the same worker go back when the worker is gone."""
@@ -436,6 +445,7 @@ class Dispatcher:
         self._write_endings()
         known = [flight.lease for flight in (*self._flights.values(), *self._deaths.waiting)]
         self._queue.requeue_forgotten(self._generation, [lease.run_id for lease in (*known, *self._ahead)])
+        self._queue.release_postdated()
 
     def _is_due(self, what: str, every_s: float) -> bool:
         if time.monotonic() < self._due.get(what, 0.0):

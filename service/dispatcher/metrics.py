@@ -15,11 +15,11 @@ from prometheus_client import (
     ProcessCollector,
     start_http_server,
 )
-from sqlalchemy.exc import InterfaceError, OperationalError
 
 from service import logs
 from service.payload import ResultPayload
 from service.settings import Settings
+from service.store.database import AWAY
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored
 from service.store.states import RunState
@@ -80,7 +80,7 @@ class DispatcherMetrics:
         try:
             with self.transactions.labels(what).time():
                 yield
-        except (OperationalError, InterfaceError):
+        except AWAY:
             self.database_errors.inc()
             raise
 

@@ -98,7 +98,15 @@ class Pool:
             events = self._client.get_events(address)
         except (OSError, TimeoutError):
             return False
-        return any(isinstance(said, dict) and said.get("action") == "closing-worker" for _, said in events)
+        # The next worker may have the same address, where ports are fixed: what counts is the last life that has ended.
+        lives: list[list[str]] = [[]]
+        for _, said in events:
+            action = str(said.get("action")) if isinstance(said, dict) else ""
+            if action == "add-worker":
+                lives.append([])
+            lives[-1].append(action)
+        ended = [life for life in lives if "remove-worker" in life] or lives
+        return "closing-worker" in ended[-1]
 
     def close(self) -> None:
         """Stop nothing more."""

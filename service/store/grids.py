@@ -15,6 +15,7 @@ from sqlalchemy.exc import IntegrityError
 
 from service.identifiers import new_grid_id, run_id, utc_now
 from service.schemas import GridPage, GridView, RunDetail, RunPage
+from service.store.bulk import insert_rows
 from service.store.database import Database
 from service.store.leases import add_event, close_grids, lock_grids, pause_queued
 from service.store.pace import recent
@@ -112,7 +113,7 @@ class GridStore:
                 connection.execute(insert(idempotency), made)
             for batch in _batches(enumerate(runs), _BATCH):
                 rows = [_run_row(grid_id, ordinal, planned, now) for ordinal, planned in batch]
-                connection.execute(insert(run), rows)
+                insert_rows(connection, run, rows)
             add_event(connection, grid_id, "grid_submitted", now, n_runs=len(runs))
             return self._grid(connection, grid_id)
 

@@ -31,14 +31,17 @@ class LeaderView:
 
 
 def require_generation(connection: Connection, generation: int) -> None:
-    """Stay in this transaction only as the leader; the shared lock keeps a successor out until it ends.
+    """Stay in this transaction only as the leader; the lock keeps a successor out until it ends.
+
+    It is the weakest that does, so that claims and heartbeats do not wait for each other.
 
     Raises
     ------
     LeadershipLostError
         The row carries another generation.
     """
-    current = connection.scalar(select(leader.c.generation).where(leader.c.id == 1).with_for_update(read=True))
+    mine = select(leader.c.generation).where(leader.c.id == 1)
+    current = connection.scalar(mine.with_for_update(read=True, key_share=True))
     if current != generation:
         raise LeadershipLostError(f"generation {generation} was deposed by generation {current}")
 

@@ -11,11 +11,15 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, func, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, exists, func, select, update
 
+from service.store.bulk import insert_rows
 from service.store.pace import recent
 from service.store.states import CANCEL, OPEN_STATES, PAUSE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
+
+AT_ONCE = 5000
+"""Runs that one statement may name: databases take so many parameters and no more."""
 
 
 class Outcome(StrEnum):
@@ -101,8 +105,9 @@ def end_attempts(
 ) -> None:
     """Write down how the attempts of leased runs ended; rows are only ever added."""
     if rows:
-        connection.execute(
-            insert(attempt),
+        insert_rows(
+            connection,
+            attempt,
             [
                 {
                     "run_id": row.id,
@@ -135,14 +140,31 @@ def requeue(
     their own. The ids of those that were not cancelled come back.
     """
     rows = leased(connection, where)
-    end_attempts(connection, rows, outcome, now, detail=detail)
-    ids = [row.id for row in rows]
     values: dict[str, Any] = {} if not_before is None else {"not_before": not_before}
     if suspect:
         values["suspect"] = True
+    given = []
+    for first in range(0, len(rows), AT_ONCE):
+        some = rows[first : first + AT_ONCE]
+        end_attempts(connection, some, outcome, now, detail=detail)
+        given += _requeue(connection, some, outcome, now, values)
+    return given
+
+
+def _requeue(
+    connection: Connection,
+    rows: Sequence[Row[*tuple[Any, ...]]],
+    outcome: Outcome,
+    now: datetime,
+    values: dict[str, Any],
+) -> list[str]:
+    ids = [row.id for row in rows]
     moved = move(connection, REQUEUE, run.c.id.in_(ids), **values)
-    for row in rows:
-        add_event(connection, row.grid_id, "run_requeued", now, row.id, outcome=outcome, attempt=row.attempt)
+    told = {"outcome": outcome}
+    add_events(
+        connection,
+        [new_event(row.grid_id, "run_requeued", now, row.id, **told, attempt=row.attempt) for row in rows],
+    )
     cancelled_grids = select(grid.c.id).where(grid.c.cancelled_at.is_not(None))
     dropped = move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now)
     if dropped:
@@ -188,7 +210,7 @@ def new_event(grid_id: str, kind: str, now: datetime, run_id: str | None = None,
 
 def add_events(connection: Connection, rows: Sequence[dict[str, Any]]) -> None:
     """Add to the outbox, in the transaction of the changes that the events report."""
-    connection.execute(insert(event), rows)
+    insert_rows(connection, event, rows)
 
 
 def add_event(

@@ -9,13 +9,15 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, insert, literal_column, select, true
+from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, literal_column, select, true, update
 
 from service.identifiers import new_token, utc_now
 from service.payload import ResultPayload
+from service.store.bulk import insert_rows
 from service.store.database import Database
 from service.store.leadership import require_generation
 from service.store.leases import (
+    AT_ONCE,
     Lease,
     Outcome,
     add_event,
@@ -24,15 +26,19 @@ from service.store.leases import (
     end_attempts,
     held_by,
     leased,
+    lock_grids,
     new_event,
     requeue,
 )
 from service.store.results import result_row
-from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move
+from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move, moving
 from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
 
 _MAX_DELAY_S = 600.0
+_JITTER = (0.5, 1.5)
+_SLACK = timedelta(seconds=1)
+"""By so much clocks may differ and nobody minds."""
 
 
 class Stored(StrEnum):
@@ -84,8 +90,9 @@ class RunQueue:
     def claim(self, generation: int, limit: int, engine: str | None = None, *, suspects: bool = False) -> list[Lease]:
         """Lease up to ``limit`` runs in the order of the queue, for workers that carry ``engine`` (None: whichever).
 
-        Suspects have a queue of their own: they are claimed by asking for them, and only then. One transaction with
-        the look at the leader row, so that a deposed dispatcher cannot claim after the new one has voided its leases.
+        5,000 at a time. Suspects have a queue of their own: they are claimed by asking for them, and only then. One
+        transaction with the look at the leader row, so that a deposed dispatcher cannot claim after the new one has
+        voided its leases.
 
         Raises
         ------
@@ -97,37 +104,30 @@ class RunQueue:
             select(run.c.id)
             .where(_ready(now, engine, suspects))
             .order_by(run.c.not_before, run.c.id)
-            .limit(limit)
+            .limit(min(limit, AT_ONCE))
             .with_for_update(skip_locked=True)
             .cte("picked")
             # Materialised, or PostgreSQL may run it again for each row and lock more than ``limit``.
             .prefix_with("MATERIALIZED", dialect="postgresql")
         )
+        taken = moving(
+            CLAIM,
+            run.c.id.in_(select(picked.c.id)),
+            token=token,
+            generation=generation,
+            leased_at=now,
+            attempt=run.c.attempt + 1,
+        ).returning(*_CLAIMED)
         with self._database.write() as connection:
             require_generation(connection, generation)
-            ids = move(
-                connection,
-                CLAIM,
-                run.c.id.in_(select(picked.c.id)),
-                token=token,
-                generation=generation,
-                leased_at=now,
-                attempt=run.c.attempt + 1,
+            rows = connection.execute(taken).all()
+        return [
+            Lease(
+                row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
+                row.engine_digest, row.suspect,
             )
-            columns = (run.c.id, run.c.grid_id, run.c.attempt, run.c.digest, run.c.spec, run.c.suspect)
-            claimed = (
-                select(*columns, grid.c.engine_digest)
-                .join(grid, grid.c.id == run.c.grid_id)
-                .where(run.c.id.in_(ids))
-                .order_by(run.c.not_before, run.c.id)
-            )
-            return [
-                Lease(
-                    row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
-                    row.engine_digest, row.suspect,
-                )
-                for row in connection.execute(claimed)
-            ]  # fmt: skip
+            for row in sorted(rows, key=lambda row: (row.not_before, row.id))
+        ]  # fmt: skip
 
     def store(self, lease: Lease, payload: ResultPayload) -> Stored:
         """Store a result if the lease is still valid.
@@ -169,7 +169,7 @@ class RunQueue:
         asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
         inputs = {row.id: row.inputs for row in asked}
         stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
-        connection.execute(insert(result), stored)
+        insert_rows(connection, result, stored)
         add_to_sums(connection, stored)
         add_events(
             connection,
@@ -190,7 +190,7 @@ class RunQueue:
                 return None
             charged = self._charged(connection, lease, rows[0].charged_from, failure.outcome)
             if charged < failure.retries:
-                delay = min(self._retry_delay_s * 2.0**charged, _MAX_DELAY_S) * random.uniform(0.5, 1.5)  # noqa: S311
+                delay = min(self._retry_delay_s * 2.0**charged, _MAX_DELAY_S) * random.uniform(*_JITTER)  # noqa: S311
                 later = now + timedelta(seconds=delay)
                 requeue(connection, held_by(lease), failure.outcome, now, failure.detail, later, failure.suspect)
                 return RunState(connection.scalars(select(run.c.state).where(run.c.id == lease.run_id)).one())
@@ -205,8 +205,13 @@ class RunQueue:
 
     def hand_back(self, leases: Sequence[Lease], outcome: Outcome = Outcome.HANDED_BACK) -> int:
         """Give runs back uncharged, at a stop; how many of the leases were still valid."""
-        with self._database.write() as connection:
-            return len(requeue(connection, _held_by_any(leases), outcome, self._clock()))
+        given = 0
+        # Each part is a transaction of its own: what a crash leaves is still leased, and given back by the next leader.
+        for first in range(0, len(leases), AT_ONCE):
+            with self._database.write() as connection:
+                some = _held_by_any(leases[first : first + AT_ONCE])
+                given += len(requeue(connection, some, outcome, self._clock()))
+        return given
 
     def requeue_lost(self, lease: Lease, outcome: Outcome, detail: str) -> bool:
         """Give one run back uncharged that went missing through no fault of its own."""
@@ -233,20 +238,51 @@ class RunQueue:
     def requeue_forgotten(self, generation: int, known: Collection[str]) -> list[str]:
         """Give back runs leased in this generation that the dispatcher does not know of.
 
-        That happens when a claim was committed and the answer to it was lost.
+        That happens when a claim was committed and the answer to it was lost. Up to 5,000 at a time; a look that finds
+        none, which is the rule, needs no lock.
         """
+        mine = (run.c.state == literal_column(f"'{RunState.LEASED}'")) & (run.c.generation == generation)
+        with self._database.read() as connection:
+            unknown = sorted(set(connection.scalars(select(run.c.id).where(mine))).difference(known))[:AT_ONCE]
+        if not unknown:
+            return []
         with self._database.write() as connection:
-            unknown = (run.c.generation == generation) & run.c.id.not_in(known)
-            return requeue(connection, unknown, Outcome.FORGOTTEN, self._clock())
+            these = (run.c.generation == generation) & run.c.id.in_(unknown)
+            return requeue(connection, these, Outcome.FORGOTTEN, self._clock())
+
+    def release_postdated(self) -> int:
+        """Let runs be claimed now that wait for a time which only a clock that was wrong can have set; how many.
+
+        A run that has not been tried waits for nothing, and no retry waits for longer than the longest back-off.
+        Without this a clock that is set back, or that of an API elsewhere which is ahead, would hold up the queue.
+        """
+        now = self._clock()
+        longest = timedelta(seconds=_MAX_DELAY_S * _JITTER[1])
+        wrong = (run.c.state == literal_column(f"'{RunState.QUEUED}'")) & (run.c.not_before > now + _SLACK)
+        wrong &= (run.c.attempt == run.c.charged_from) | (run.c.not_before > now + longest)
+        grids = select(run.c.grid_id).where(wrong).distinct()
+        with self._database.read() as connection:
+            if connection.scalar(grids.limit(1)) is None:
+                return 0
+        with self._database.write() as connection:
+            lock_grids(connection, connection.scalars(grids))
+            return connection.execute(update(run).where(wrong).values(not_before=now)).rowcount
+
+    def to_hold(self, generation: int) -> list[str]:
+        """Ids of runs leased in this generation whose grid has been paused."""
+        return self._leased_where(generation, grid.c.paused_at.is_not(None))
 
     def to_cancel(self, generation: int) -> list[str]:
         """Ids of runs leased in this generation whose grid has been cancelled."""
+        return self._leased_where(generation, grid.c.cancelled_at.is_not(None))
+
+    def _leased_where(self, generation: int, condition: ColumnElement[bool]) -> list[str]:
         with self._database.read() as connection:
             wanted = (
                 select(run.c.id)
                 .join(grid, grid.c.id == run.c.grid_id)
-                .where(run.c.state == RunState.LEASED, run.c.generation == generation)
-                .where(grid.c.cancelled_at.is_not(None))
+                .where(run.c.state == literal_column(f"'{RunState.LEASED}'"), run.c.generation == generation)
+                .where(condition)
             )
             return list(connection.scalars(wanted))
 
@@ -279,6 +315,20 @@ class RunQueue:
             detail = {"attempt": lease.attempt, "same": same}
             add_event(connection, lease.grid_id, "stale_result", now, lease.run_id, **detail)
         return Stored.STALE_SAME if same else Stored.STALE_OTHER
+
+
+_ENGINE = select(grid.c.engine_digest).where(grid.c.id == run.c.grid_id).correlate(run).scalar_subquery()
+# All by the statement that claims: each one more is another wait for the server's turn.
+_CLAIMED = (
+    run.c.id,
+    run.c.grid_id,
+    run.c.attempt,
+    run.c.digest,
+    run.c.spec,
+    run.c.suspect,
+    run.c.not_before,
+    _ENGINE.label("engine_digest"),
+)
 
 
 def _ready(now: datetime, engine: str | None, suspects: bool) -> ColumnElement[bool]:

@@ -5,7 +5,16 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from service.payload import COUNTS, ESTIMATES, QUANTITIES, AperturePayload, EstimatePayload, ResultPayload
+from service.payload import (
+    COUNTS,
+    ESTIMATES,
+    LENS_PARAMETERS,
+    QUANTITIES,
+    AperturePayload,
+    EstimateName,
+    EstimatePayload,
+    ResultPayload,
+)
 from service.store.leases import Lease
 from service.store.tables import INPUT_COLUMNS
 
@@ -17,9 +26,11 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
     for estimate in ESTIMATES:
         row |= _estimate_columns(estimate, payload.estimates[estimate])
     row |= _aperture_columns(payload.aperture)
-    for name, value in payload.lens.items():
-        prefix = f"lens_{name.lower()}"
-        row |= {f"{prefix}_mean": value.mean, f"{prefix}_sd": value.sd, f"{prefix}_truth": value.truth}
+    # Every row names every column, or those that are written together would lack what the first of them has not.
+    for name in LENS_PARAMETERS:
+        value, prefix = payload.lens.get(name), f"lens_{name.lower()}"
+        for part in ("mean", "sd", "truth"):
+            row[f"{prefix}_{part}"] = None if value is None else getattr(value, part)
     chain = payload.chain.model_dump()
     row |= {"chain_status": chain.pop("status"), **chain}
     plain = (
@@ -42,15 +53,27 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
     return row
 
 
-def _estimate_columns(estimate: str, found: EstimatePayload | None) -> dict[str, Any]:
+_ESTIMATE_COLUMNS = {
+    estimate: (
+        [(quantity, *(f"{estimate}_{quantity}_{part}" for part in ("mean", "sd", "bias"))) for quantity in QUANTITIES],
+        [(part, f"{estimate}_{part}") for part in COUNTS],
+    )
+    for estimate in ESTIMATES
+}
+
+
+def _estimate_columns(estimate: EstimateName, found: EstimatePayload | None) -> dict[str, Any]:
     """Columns of one estimate, every one of them null where there is none."""
     row: dict[str, Any] = {}
-    for quantity in QUANTITIES:
+    quantities, counts = _ESTIMATE_COLUMNS[estimate]
+    for quantity, mean, sd, bias in quantities:
         value = None if found is None else getattr(found, quantity)
-        for part in ("mean", "sd", "bias"):
-            row[f"{estimate}_{quantity}_{part}"] = None if value is None else getattr(value, part)
-    for part in COUNTS:
-        row[f"{estimate}_{part}"] = None if found is None else getattr(found, part)
+        if value is None:
+            row[mean] = row[sd] = row[bias] = None
+        else:
+            row[mean], row[sd], row[bias] = value.mean, value.sd, value.bias
+    for part, column in counts:
+        row[column] = None if found is None else getattr(found, part)
     return row
 
 

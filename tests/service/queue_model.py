@@ -4,7 +4,8 @@ Beside the database runs a model of a few dictionaries; after every step both mu
 
     python -m tests.service.queue_model --steps 100000 [--database URL]
 
-It empties the database that it is given; without one it makes a SQLite file of its own.
+It empties the database that it is given; without one it makes a SQLite file of its own, and with ``--database
+postgresql`` a server of its own.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,8 @@ from hypothesis.stateful import (
 )
 from sqlalchemy import func, select
 
+from service.drills.drill import THROW_AWAY
+from service.drills.postgres import FAST, postgres_server
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership, LeadershipLostError
@@ -253,6 +257,11 @@ class Queue(RuleBasedStateMachine):
             if found.state is LEASED and run_id not in ids:
                 self.requeue(found)
 
+    @rule()
+    def clocks_are_looked_at(self) -> None:
+        """None of them was wrong, so nobody's delay is cut short."""
+        assert self.queue.release_postdated() == 0
+
     @rule(seconds=st.floats(0.1, 20.0))
     def time_passes(self, seconds: float) -> None:
         self.pass_time(seconds)
@@ -370,10 +379,14 @@ def main() -> None:
     """Run at least as many steps as are asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=100_000)
-    parser.add_argument("--database", help="URL of a database that may be emptied")
+    parser.add_argument("--database", help="URL of a database that may be emptied, or postgresql: a server of its own")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        url = given.database or f"sqlite:///{Path(folder) / 'model.sqlite'}"
+    with ExitStack() as stack:
+        if given.database == THROW_AWAY:
+            url = stack.enter_context(postgres_server(FAST)).create("model")
+        else:
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            url = given.database or f"sqlite:///{Path(folder) / 'model.sqlite'}"
         upgrade(url)
         began, done = time.monotonic(), 0
         while done < given.steps:

@@ -12,14 +12,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
+import dask.config
 import psutil
 import pytest
 from distributed import Client
+from distributed.batched import BatchedSend
 from pydantic import ValidationError
 from sqlalchemy import select
 
 from engine import engine_digest
-from service.dispatcher.clusters import kubernetes_spec, security_of, slurm
+from service.dispatcher.clusters import dask_config, kubernetes_spec, security_of, slurm
 from service.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
@@ -264,3 +266,9 @@ def test_cluster_settings_that_do_not_fit_each_other_are_refused(tmp_path: Path)
     ):
         with pytest.raises(ValidationError, match=said):
             Settings(**wrong)
+
+
+def test_dask_keeps_few_of_the_messages_that_carry_runs() -> None:
+    """A thousand of them, which is its default, are tens of megabytes that the dispatcher grows by."""
+    with dask.config.set(dask_config(Settings())):
+        assert (BatchedSend(interval="2ms").recent_message_log.maxlen or 1000) <= 10

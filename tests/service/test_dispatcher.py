@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 from distributed import KilledWorker
-from sqlalchemy.exc import DataError, OperationalError
+from sqlalchemy.exc import DataError, InternalError, OperationalError, StatementError
 
 from engine import engine_digest
 from service.dispatcher.attribution import Deaths
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.loop import Dispatcher
-from service.dispatcher.pool import Worker
+from service.dispatcher.pool import Pool, Worker
 from service.payload import ResultPayload
 from service.settings import Settings
 from service.store.database import Database
@@ -380,6 +380,42 @@ def test_runs_claimed_ahead_are_cancelled_with_their_grid(ahead: Setting) -> Non
     assert len(ahead.pool.submitted) == 2
 
 
+def test_runs_claimed_ahead_are_not_started_once_their_grid_is_paused(ahead: Setting, tmp_path: Path) -> None:
+    ahead.grids.pause(ahead.grid_id)
+    ahead.dispatcher._due.clear()
+    ahead.run(until=lambda: ahead.grids.grid(ahead.grid_id).counts.paused == 4)
+    for future in ahead.pool.futures:
+        future.finish(tmp_path)
+    ahead.run(steps=20)
+    counts = ahead.grids.grid(ahead.grid_id).counts
+    assert (counts.done, counts.paused, len(ahead.pool.submitted)) == (2, 4, 2)
+
+
+def test_the_worker_of_each_cancelled_run_is_stopped_though_the_database_goes_away_in_between(
+    database: Database, tmp_path: Path
+) -> None:
+    class Failing(ShakyQueue):
+        def cancel_leased(self, lease: Lease) -> bool:
+            if self.away == 1:
+                self.away = 0
+                raise OperationalError("UPDATE", {}, Exception("the database is away"))
+            self.away += len(self.events) > 0 and self.events[-1] == "claim"
+            self.events.append("cancelled")
+            return super().cancel_leased(lease)
+
+    pool = InstantPool(tmp_path, "pending", "pending")
+    setting = Setting(database, pool, runs=2)
+    setting.queue.__class__ = Failing
+    setting.run(until=lambda: len(pool.submitted) == 2)
+    setting.grids.cancel(setting.grid_id)
+    setting.dispatcher._due.clear()
+    setting.run(steps=3)
+    setting.dispatcher._due.clear()
+    setting.run(steps=3)
+    assert setting.grids.grid(setting.grid_id).state is GridState.CANCELLED
+    assert len(pool.stopped) == 2
+
+
 def test_a_stop_hands_back_what_was_claimed_ahead_and_starts_nothing_more(ahead: Setting, tmp_path: Path) -> None:
     for future in ahead.pool.futures:
         future.finish(tmp_path)
@@ -416,6 +452,51 @@ def test_one_result_that_the_database_refuses_keeps_no_other_out(database: Datab
     setting.run()
     counts = setting.grids.grid(setting.grid_id).counts
     assert (counts.done, counts.failed) == (7, 1)
+
+
+def test_a_result_that_cannot_even_be_handed_to_the_database_ends_its_run_and_not_the_dispatcher(
+    database: Database, tmp_path: Path
+) -> None:
+    class Surprised(ShakyQueue):
+        def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+            if any(lease.spec["seed"] == 1 for lease, _ in results):
+                raise StatementError("a value is required", "INSERT", {}, Exception("for a parameter"))
+            return super().store_all(results)
+
+    setting = Setting(database, InstantPool(tmp_path), runs=3)
+    setting.queue.__class__ = Surprised
+    setting.run()
+    counts = setting.grids.grid(setting.grid_id).counts
+    assert (counts.done, counts.failed) == (2, 1)
+
+
+def test_results_are_kept_while_the_database_is_a_read_only_replica(database: Database, tmp_path: Path) -> None:
+    class ReadOnly(ShakyQueue):
+        def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+            if self.away:
+                self.away -= 1
+                raise InternalError("INSERT", {}, Exception("cannot execute INSERT in a read-only transaction"))
+            return super().store_all(results)
+
+    setting = Setting(database, InstantPool(tmp_path), runs=2)
+    setting.queue.__class__, setting.queue.away = ReadOnly, 2
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 2
+    assert len(setting.pool.submitted) == 2
+
+
+def test_a_worker_that_died_where_another_was_told_to_go_before_has_died() -> None:
+    """With fixed ports the next worker has the address of the last."""
+
+    def closed(*actions: str) -> bool:
+        client = SimpleNamespace(get_events=lambda _: [(0.0, {"action": action}) for action in actions])
+        return Pool(client, Settings()).closed_on_purpose("tcp://worker:1")
+
+    told_to_go = ("add-worker", "closing-worker", "remove-worker")
+    assert closed(*told_to_go)
+    assert closed(*told_to_go, "add-worker"), "the next has come before anybody asked"
+    assert not closed(*told_to_go, "add-worker", "remove-worker")
+    assert not closed(*told_to_go, "add-worker", "remove-worker", "add-worker")
 
 
 def test_a_run_whose_worker_left_without_dask_blaming_it_goes_back_uncharged(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import tempfile
 from pathlib import Path
 
 import psutil
@@ -10,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli import app
+from service.drills import postgres
 from service.drills.command import DRILLS
 from service.drills.drill import Ground, OccupiedError, ground
 from service.drills.kills import SchedulerKills, WorkerKills
@@ -86,6 +89,10 @@ def test_two_workers_apart_lose_nothing_and_are_measured_against_one(tmp_path: P
     assert alone >= 0.4
     assert together >= 0.2
     assert ratio == alone / together
+    # Four runs of 0.1 s, by one and by two; the kernel counts the CPU of others in hundredths of a second.
+    for spent in str(report.value("CPU of workers: with one / with two")).split(" / "):
+        assert float(spent) >= 0.35
+    assert float(report.value("ratio without these waits")) > 0
     assert nobody_left(tmp_path)
 
 
@@ -103,6 +110,34 @@ def test_the_command_shows_writes_and_ends_as_the_claims_say(tmp_path: Path) -> 
     for wrong in (["nonsense"], ["cancel", "days=3"], ["cancel", "runs=many"]):
         assert run.invoke(app, ["drill", *wrong]).exit_code == 2
     assert run.invoke(app, ["drill", "cancel", "fast"]).exit_code == 1
+
+
+@pytest.mark.postgres
+def test_a_drill_on_postgresql_brings_its_own_server_and_leaves_none(tmp_path: Path) -> None:
+    before = len(list(Path(tempfile.gettempdir()).glob("hostlens-pg-*")))
+    file = tmp_path / "report.json"
+    wanted = ["drill", "throughput", "runs=300", "--database", "postgresql", "--json", str(file)]
+    CliRunner().invoke(app, wanted)
+    document = json.loads(file.read_text())
+    assert document["claims"][0] == {"text": "300 runs done, each stored once", "holds": True}
+    assert document["conditions"].endswith("all processes on one core, PostgreSQL")
+    # The server's work is counted: a run cannot be stored for nothing.
+    spent = {figure["name"]: figure["value"] for figure in document["figures"]}
+    assert spent["CPU a run, PostgreSQL"] > 0.05
+    assert len(list(Path(tempfile.gettempdir()).glob("hostlens-pg-*"))) == before
+
+
+def test_a_drill_says_what_postgresql_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    with monkeypatch.context() as without_driver:
+        without_driver.setitem(sys.modules, "psycopg", None)
+        for database in ("postgresql", "postgresql://nobody@/nothing"):
+            said = CliRunner().invoke(app, ["drill", "idempotency", "--database", database])
+            assert (said.exit_code, "extra postgres" in said.output) == (2, True), said.output
+    monkeypatch.delenv("PG_BIN", raising=False)
+    monkeypatch.setattr(postgres, "_DEBIAN", tmp_path)
+    monkeypatch.setattr(postgres, "find_spec", lambda _: None)
+    said = CliRunner().invoke(app, ["drill", "idempotency", "--database", "postgresql"])
+    assert (said.exit_code, "set PG_BIN" in said.output) == (2, True), said.output
 
 
 def test_a_drill_refuses_a_database_with_grids(sqlite_url: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -9,17 +10,21 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import pytest
-from sqlalchemy import func, select
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy import func, select, text, update
+from sqlalchemy.event import listen
+from sqlalchemy.exc import IntegrityError, OperationalError
 
+from service.payload import QuantityPayload
+from service.store import leases as leases_module
+from service.store import queue as queue_module
 from service.store.database import Database
 from service.store.grids import GridStore, KeyReusedError, NotFoundError
-from service.store.leadership import Leadership, LeadershipLostError
+from service.store.leadership import Leadership, LeadershipLostError, require_generation
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored
 from service.store.states import GridState, RunState
-from service.store.tables import event, result, run
-from tests.service.conftest import Clock
+from service.store.tables import event, leader, result, run
+from tests.service.conftest import Clock, empty
 from tests.service.plans import body, planned, result_of, submit
 
 T = TypeVar("T")
@@ -129,6 +134,26 @@ def test_a_stored_run_is_done_and_has_one_result_with_its_inputs(
     assert (row.system, row.camera, row.n, row.magnitude, row.seed) == ("HE0435", "WFC3-IR_F160W", 2.0, 20.5, 0)
     grid = grids.grid(grid_id)
     assert (grid.state, grid.counts.done, grid.progress, grid.eta_seconds) == (GridState.DONE, 1, 1.0, 0.0)
+
+
+def test_results_with_other_lens_parameters_are_stored_together(
+    database: Database, grids: GridStore, queue: RunQueue, generation: int
+) -> None:
+    """One system has an external shear and another has none; their runs may end in the same moment."""
+    submit(grids, 4)
+    leases = queue.claim(generation, 4)
+    with_shear = {"gamma1": QuantityPayload(mean=0.01, sd=0.001, truth=0.02)}
+    for pair, sheared in ((leases[:2], 0), (leases[2:], 1)):
+        payloads = [result_of(lease) for lease in pair]
+        lens = {**payloads[sheared].lens, **with_shear}
+        payloads[sheared] = payloads[sheared].model_copy(update={"lens": lens})
+        queue.store_all(list(zip(pair, payloads, strict=True)))
+    found = [grids.run(lease.run_id).result for lease in leases]
+    assert [result is not None and "gamma1" in result.lens for result in found] == [True, False, False, True]
+    assert found[0] is not None
+    assert found[3] is not None
+    assert found[0].lens["gamma1"].model_dump() == found[3].lens["gamma1"].model_dump()
+    assert found[0].lens["gamma1"].truth == 0.02
 
 
 def test_a_result_comes_too_late_once_another_was_stored(
@@ -329,6 +354,76 @@ def test_runs_that_the_dispatcher_does_not_know_of_go_back(grids: GridStore, que
     assert sorted(given_back) == [lease.run_id for lease in unknown]  # in which order, a database does not promise
     assert queue.requeue_forgotten(generation, [known.run_id]) == []
     assert queue.store(known, result_of(known)) is Stored.STORED
+
+
+def test_a_wide_cluster_asks_the_database_for_no_more_parameters_than_it_takes(
+    sqlite_url: str, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite takes 32,766 at most, PostgreSQL 65,535: here a hundred, and no statement names more than forty runs."""
+    for module in (leases_module, queue_module):
+        monkeypatch.setattr(module, "AT_ONCE", 40)
+    database = Database(sqlite_url)
+    listen(
+        database.engine,
+        "connect",
+        lambda connection, _: connection.setlimit(sqlite3.SQLITE_LIMIT_VARIABLE_NUMBER, 100),
+    )
+    grids, queue, leadership = GridStore(database, clock), RunQueue(database, clock), Leadership(database, 30.0, clock)
+    submit(grids, 150)
+    generation = leadership.take("first")
+    assert generation == 1
+    leases: list[Lease] = []
+    while claimed := queue.claim(generation, 150):
+        assert len(claimed) <= 40
+        leases += claimed
+    assert len(leases) == 150
+    assert queue.requeue_forgotten(generation, [lease.run_id for lease in leases]) == []
+    assert len(queue.requeue_forgotten(generation, [lease.run_id for lease in leases[:110]])) == 40
+    assert queue.hand_back(leases[:60]) == 60
+    assert leadership.take("second", lambda _: True) == 2
+    assert grids.grid(leases[0].grid_id).counts.queued == 150
+    database.close()
+
+
+def test_a_clock_that_is_set_back_holds_up_neither_new_runs_nor_retries(
+    grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    submit(grids, 3)
+    assert queue.fail(one(queue, generation), ERROR) is RunState.QUEUED
+    clock.advance(-7200)
+    assert queue.claim(generation, 3) == []
+    assert queue.release_postdated() == 3
+    assert len(queue.claim(generation, 3)) == 3
+
+
+def test_a_retry_waits_for_its_delay_however_often_clocks_are_looked_at(
+    grids: GridStore, queue: RunQueue, generation: int, clock: Clock
+) -> None:
+    submit(grids, 1)
+    queue.fail(one(queue, generation), ERROR)
+    assert queue.release_postdated() == 0
+    assert queue.claim(generation, 1) == []
+    clock.advance(3.0)
+    assert len(queue.claim(generation, 1)) == 1
+
+
+@pytest.mark.postgres
+def test_claims_and_heartbeats_do_not_wait_for_each_other(migrated_postgres: str, clock: Clock) -> None:
+    empty(migrated_postgres)
+    database = Database(migrated_postgres)
+    leadership = Leadership(database, 30.0, clock)
+    assert leadership.take("first") == 1
+    with database.write() as claiming, database.write() as other:
+        require_generation(claiming, 1)
+        other.execute(text("SET LOCAL lock_timeout = '200ms'"))
+        # As a heartbeat does; a successor's lock is another matter.
+        other.execute(update(leader).values(workers=3))
+    with database.write() as claiming, database.engine.connect() as other:
+        require_generation(claiming, 1)
+        other.execute(text("SET lock_timeout = '200ms'"))
+        with pytest.raises(OperationalError, match="lock timeout"):
+            other.execute(select(leader).with_for_update())
+    database.close()
 
 
 def test_a_deposed_leader_claims_nothing(
