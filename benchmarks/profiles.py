@@ -3,7 +3,8 @@
     python -m benchmarks.profiles [--systems HE0435 ...]
 
 For the lens parameters and ln lambda the largest difference of means, in standard deviations of the reference, and the
-largest departure of a ratio of widths from one. The table goes to docs/tables/profiles.md.
+largest departure of a ratio of widths from one. The table goes to docs/tables/profiles.md as each system ends; rows of
+systems that are not run stay in it, each with the engine that it was made by.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from engine import Analysis, Host, Realization, measure, simulate_realization
 from engine.catalogue import system_names
+from engine.digest import engine_digest
 from engine.run import Measurement
 from engine.spec import ProfileName
 
@@ -29,20 +31,33 @@ def quantities(found: Measurement) -> np.ndarray:
     return np.array([(p.value.mean, p.value.sd) for p in found.lens])
 
 
+HEAD = """# Profiles
+
+Written by `python -m benchmarks.profiles`: one image of each system (n = 2, 20.5 mag, R_eff 0.39 arcsec)
+analysed with each profile, one core. Differences are in standard deviations of `reference`, of the lens
+parameters and ln lambda: the largest of means, and the largest departure of a ratio of widths from one.
+
+| system | profile | engine | CPU s | evaluations | tau | N_eff | R-hat | acceptance | means | widths | `image` mag |
+|---|---|---|---|---|---|---|---|---|---|---|---|
+"""
+
+
+def write(rows: dict[str, list[str]]) -> None:
+    """The table of these systems' rows, and of those that it holds for others."""
+    held: dict[str, list[str]] = {}
+    for line in TABLE.read_text().splitlines() if TABLE.exists() else ():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) > 2 and cells[2] in PROFILES:
+            held.setdefault(cells[1], []).append(line)
+    lines = [line for system in system_names() for line in (held | rows).get(system, [])]
+    TABLE.write_text(HEAD + "\n".join([*lines, ""]))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--systems", nargs="+", default=list(system_names()))
     given = parser.parse_args()
-    lines = [
-        "# Profiles",
-        "",
-        "Written by `python -m benchmarks.profiles`: one image of each system (n = 2, 20.5 mag, R_eff 0.39 arcsec)",
-        "analysed with each profile, one core. Differences are in standard deviations of `reference`, of the lens",
-        "parameters and ln lambda: the largest of means, and the largest departure of a ratio of widths from one.",
-        "",
-        "| system | profile | CPU s | evaluations | tau | N_eff | R-hat | acceptance | means | widths | `image` mag |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    rows: dict[str, list[str]] = {}
     for system in given.systems:
         realization = Realization(system=system, l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=20.5))
         simulation = simulate_realization(realization)
@@ -65,14 +80,13 @@ def main() -> None:
             widths = float(np.abs(here[:, 1] / reference[:, 1] - 1.0).max())
             chain = found.chain.summary
             magnitude = next(e for e in found.estimates if (e.estimator, e.index_prior) == ("image", "wide")).magnitude
-            lines.append(
-                f"| {system} | {profile} | {seconds:.0f} | {chain.evaluations} | {chain.tau:.1f} | "
-                f"{chain.effective_samples:.0f} | {chain.r_hat:.3f} | {chain.acceptance:.2f} | {means:.2f} | "
-                f"{100 * widths:.0f} % | {magnitude.mean:.3f} ± {magnitude.sd:.3f} |"
+            rows.setdefault(system, []).append(
+                f"| {system} | {profile} | `{engine_digest()[:8]}` | {seconds:.0f} | {chain.evaluations} | "
+                f"{chain.tau:.1f} | {chain.effective_samples:.0f} | {chain.r_hat:.3f} | {chain.acceptance:.2f} | "
+                f"{means:.2f} | {100 * widths:.0f} % | {magnitude.mean:.3f} ± {magnitude.sd:.3f} |"
             )
-            print(lines[-1], flush=True)
-    TABLE.parent.mkdir(parents=True, exist_ok=True)
-    TABLE.write_text("\n".join([*lines, ""]))
+            print(rows[system][-1], flush=True)
+        write(rows)
 
 
 if __name__ == "__main__":
