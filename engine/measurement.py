@@ -117,6 +117,14 @@ class ImageMeasurement:
         """Name of the estimator whose answer ``host`` is."""
         return self.host.estimator
 
+    @property
+    def inversion_chi2_per_dof(self) -> float | None:
+        """Of the inversion with the noise that the parametric fit takes, its misfit not counted; None without one."""
+        if self.inversion is None:
+            return None
+        counted = self.fit.misfit if self.observation.response is None else 1.0
+        return counted * self.inversion.chi2 / self.inversion.degrees_of_freedom
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form, without the arrays."""
         fit, chain = self.fit, None if self.inversion is None else self.inversion.chain.summary
@@ -136,9 +144,7 @@ class ImageMeasurement:
                 else {name: asdict(value) for name, value in self.lens_by_inversion.items()}
             ),
             "chain": None if chain is None else asdict(chain),
-            "inversion_chi2_per_dof": (
-                None if self.inversion is None else self.inversion.chi2 / self.inversion.degrees_of_freedom
-            ),
+            "inversion_chi2_per_dof": self.inversion_chi2_per_dof,
             "stamp_error": fit.stamp_error,
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,

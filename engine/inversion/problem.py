@@ -90,6 +90,9 @@ def _noise(
         # Where stars are moved stamps, the fit knows how wrong they are.
         known = np.isfinite(fit.sigma[mask])
         variance = np.where(known, np.maximum(variance, fit.sigma[mask] ** 2), variance)
+        # What the model misses counts as noise, as in the errors of the fit: in an image that no model describes a
+        # chain would stay in the first false maximum.
+        variance = variance * fit.misfit
     boost = np.where(core[mask], variance * CORE_BOOST**2, 0.0)
     if analysis.noise_treatment == "covariance":
         if observation.covariance is None:

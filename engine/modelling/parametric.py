@@ -125,6 +125,11 @@ class ParametricFit:
     arc: FloatArray
     sigma: FloatArray
 
+    @property
+    def misfit(self) -> float:
+        """chi^2 per degree of freedom where it is above one: by this the variances are larger than ``sigma`` says."""
+        return max(1.0, self.chi2 / self.degrees_of_freedom)
+
 
 @dataclass(frozen=True)
 class _Solution:

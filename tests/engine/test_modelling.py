@@ -117,6 +117,20 @@ def test_the_mask_is_a_ring_with_its_cores_boosted(simulation: Simulation, fit: 
     assert problem.amplitude_names == ("agn1", "agn2", "agn3", "agn4", "deflector", "background")
 
 
+def test_what_a_fit_misses_is_noise_to_the_inversion_where_stars_are_stamps(
+    simulation: Simulation, fit: ParametricFit
+) -> None:
+    stamped = replace(simulation.observation, response=None)
+    poor = replace(fit, chi2=4.0 * fit.degrees_of_freedom)
+    good = replace(fit, chi2=0.9 * fit.degrees_of_freedom)
+    assert (poor.misfit, good.misfit) == (4.0, 1.0)
+    analysis = Analysis(noise_treatment="diagonal", source_envelope=False)
+    sigma = [prepare_problem(stamped, found, analysis).operator.whitened.covariance for found in (good, poor)]
+    assert np.allclose(sigma[1], 2.0 * sigma[0])
+    exact = [prepare_problem(simulation.observation, found, analysis) for found in (good, poor)]
+    assert np.array_equal(*(problem.operator.whitened.covariance for problem in exact))
+
+
 def test_the_noise_treatments_differ_as_they_say(simulation: Simulation, fit: ParametricFit) -> None:
     observation = simulation.observation
     paper = prepare_problem(observation, fit, Analysis(noise_treatment="paper_code"))
