@@ -24,6 +24,7 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         lens_covariance=1e-6 * np.eye(len(names)),
         host_covariance=1e-6 * np.eye(7),
         hosts={},
+        stamp_error=1.0,
         at_bound=(),
         model=np.zeros(shape),
         arc=np.zeros(shape),
