@@ -1,6 +1,7 @@
 """Evaluations of ln Z that our chain and nautilus need for the same posterior, side by side.
 
-    pip install -c constraints.txt -e '.[bench]' && python -m benchmarks.samplers [--system HE0435] [--effective 800]
+    pip install -c constraints.txt -e '.[bench]'
+    python -m benchmarks.samplers [--system HE0435] [--n 2] [--r-eff 0.39] [--magnitude 20.5] [--effective 800]
 
 The posterior is that of the profile ``standard``, ln lambda included. Nautilus (Lange 2023), which PyAutoLens searches
 with by default, is given a box of 30 standard deviations about the maximum; our chain starts from a parametric fit, and
@@ -52,15 +53,21 @@ def nautilus_posterior(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--system", default="HE0435")
+    parser.add_argument("--n", type=float, default=2.0)
+    parser.add_argument("--r-eff", type=float, default=0.39)
+    parser.add_argument("--magnitude", type=float, default=20.5)
     parser.add_argument("--effective", type=float, default=800.0)
     given = parser.parse_args()
-    realization = Realization(system=given.system, l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=20.5))
+    realization = Realization(
+        system=given.system, l_eta=1.0, host=Host(n=given.n, r_eff=given.r_eff, magnitude=given.magnitude)
+    )
     simulation = simulate_realization(realization)
-    analysis, images = Analysis(), len(simulation.scene.agn)
+    analysis, scene = Analysis(), simulation.scene
+    shear = scene.lens.gamma1 != 0.0 or scene.lens.gamma2 != 0.0
     with threadpool_limits(1):
         began = time.process_time()
-        fit = fit_parametric(simulation.observation, agn_images=images)
-        target = prepare_target(prepare_problem(simulation.observation, fit, analysis), fit, analysis, shear=False)
+        fit = fit_parametric(simulation.observation, agn_images=len(scene.agn), shear=shear)
+        target = prepare_target(prepare_problem(simulation.observation, fit, analysis), fit, analysis, shear=shear)
         laplace = find_optimum(target, *find_start(target, fit))
         chain = run_chain(
             target,

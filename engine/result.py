@@ -90,7 +90,8 @@ class ChainSummary:
     """How well the posterior is sampled.
 
     ``tau`` is the integrated autocorrelation time in steps, largest over the parameters; ``effective_samples`` the
-    number of independent samples that it leaves; ``r_hat`` the split R-hat (:mod:`engine.posterior.convergence`), None
+    number of independent samples that it leaves; ``burn_in`` the steps of all walkers that the evaluations before the
+    first sample would have made; ``r_hat`` the split R-hat (:mod:`engine.posterior.convergence`), None
     where it was not computed.
     """
 

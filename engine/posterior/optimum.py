@@ -11,7 +11,7 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError, PosteriorError
 from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens
-from engine.posterior.target import Target
+from engine.posterior.target import Recorded, Target
 
 _MAX_ROUNDS = 12
 _MAX_STEP = 4.0
@@ -20,12 +20,16 @@ _STRENGTH_SD = 0.3
 
 @dataclass(frozen=True)
 class Laplace:
-    """Maximum and covariance of the Gaussian that matches the curvature there."""
+    """Maximum and covariance of the Gaussian that matches the curvature there.
+
+    ``known`` are the points (n, d) where the target was evaluated on the way, and its finite ln (n,) at them.
+    """
 
     mean: FloatArray
     covariance: FloatArray
     ln_posterior: float
     rounds: int
+    known: tuple[FloatArray, FloatArray] | None = None
 
 
 def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, high: float = 20.0) -> float:
@@ -48,7 +52,7 @@ def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, hig
 
 
 def _quadratic_model(
-    target: Target, centre: FloatArray, value: float, root: FloatArray
+    target: Recorded, centre: FloatArray, value: float, root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Gradient and Hessian of the target in the coordinates z of centre + root z, from steps of one."""
     d = centre.size
@@ -78,8 +82,9 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
     PosteriorError
         The posterior is not finite at the start.
     """
+    known = Recorded(target)
     mean = start.copy()
-    value = target(mean)
+    value = known(mean)
     if not math.isfinite(value):
         raise PosteriorError(
             f"start {dict(zip(target.prior.names, start.tolist(), strict=True))}: posterior not finite"
@@ -88,7 +93,7 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
     rounds = 0
     while rounds < _MAX_ROUNDS:
         rounds += 1
-        gradient, hessian = _quadratic_model(target, mean, value, root)
+        gradient, hessian = _quadratic_model(known, mean, value, root)
         eigenvalues, vectors = np.linalg.eigh(hessian)
         curvature = np.clip(np.abs(eigenvalues), 0.05, None)
         projected = vectors.T @ gradient
@@ -99,7 +104,7 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
         trial = -math.inf
         for _ in range(6):
             candidate = mean + root @ step
-            trial = target(candidate)
+            trial = known(candidate)
             if trial > value:
                 mean, value = candidate, trial
                 break
@@ -108,7 +113,7 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
         root = np.asarray(np.linalg.cholesky(root @ root.T), dtype=np.float64)
         if gain < 0.02 or (not trial > value and gain < 0.5):
             break
-    return Laplace(mean, root @ root.T, value, rounds)
+    return Laplace(mean, root @ root.T, value, rounds, (np.array(known.points), np.array(known.values)))
 
 
 def start_covariance(lens_covariance: FloatArray, inflation: float = 4.0) -> FloatArray:

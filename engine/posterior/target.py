@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -153,3 +153,28 @@ class Target:
     def invert(self, values: FloatArray) -> Inversion:
         """The full inversion at a parameter vector."""
         return invert(self.operator, self.lens(values), float(values[-1]), self.source)
+
+
+@dataclass
+class Recorded:
+    """A target that remembers where it was evaluated and what it was there, minus infinity left out."""
+
+    target: Callable[[FloatArray], float]
+    points: list[FloatArray] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+
+    def __call__(self, values: FloatArray) -> float:
+        """Ln of the target."""
+        found = self.target(values)
+        self.remember(values, found)
+        return found
+
+    def remember(self, values: FloatArray, found: float) -> None:
+        """Take note of ln of the target at a place once more, as of the latest that is known."""
+        if math.isfinite(found):
+            self.points.append(np.array(values))
+            self.values.append(found)
+
+    def latest(self, most: int) -> tuple[FloatArray, FloatArray]:
+        """The last points (n, d) and ln of the target (n,) there."""
+        return np.array(self.points[-most:]), np.array(self.values[-most:])

@@ -2,6 +2,7 @@
 
 import math
 
+import emcee
 import numpy as np
 import pytest
 
@@ -9,7 +10,9 @@ from engine.errors import PosteriorError
 from engine.inversion.regularisation import SourceModel
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
-from engine.posterior.target import Prior, Target, wide_prior
+from engine.posterior.proposal import StudentProposal
+from engine.posterior.surrogate import Surrogate, learn_surrogate
+from engine.posterior.target import Prior, Recorded, Target, wide_prior
 from tests.engine.dense_oracle import LENS, Case
 
 
@@ -60,6 +63,106 @@ def test_a_chain_that_is_too_short_says_so() -> None:
     )
     assert chain.summary.status == "not_converged"
     assert chain.summary.steps == 20
+
+
+class Banana:
+    """A Gaussian bent along a parabola, as posteriors of faint arcs are: x1 = u1 + b (x0^2 - s^2)."""
+
+    def __init__(self, dimensions: int = 7, bend: float = 0.3, spread: float = 1.5) -> None:
+        self.bend, self.spread = bend, spread
+        self.mean = np.zeros(dimensions)
+        # Var(x0^2) = 2 s^4 of a normal x0.
+        self.sd = np.ones(dimensions)
+        self.sd[0], self.sd[1] = spread, math.sqrt(1.0 + 2.0 * bend**2 * spread**4)
+        self.prior = Prior.flat(tuple("abcdefgh"[:dimensions]), self.mean - 50.0, self.mean + 50.0)
+        self.evaluations = 0
+
+    def __call__(self, values: np.ndarray) -> float:
+        self.evaluations += 1
+        straight = values.copy()
+        straight[0] /= self.spread
+        straight[1] -= self.bend * (values[0] ** 2 - self.spread**2)
+        return float(-0.5 * straight @ straight)
+
+
+def test_a_chain_follows_a_posterior_that_bends() -> None:
+    target = Banana()
+    laplace = find_optimum(target, target.mean + 0.3, np.eye(7))
+    chain = run_chain(target, laplace, walkers=8, max_steps=600, length=100.0, rng=np.random.default_rng(1))
+    assert chain.summary.status == "converged"
+    # 1.8-3.6 was seen with four seeds; draws from the best t distribution have 10 and more.
+    assert chain.summary.tau < 5.0
+    error = 1.0 / math.sqrt(chain.summary.effective_samples)
+    flat = chain.flat()
+    assert np.abs((flat.mean(axis=0) - target.mean) / target.sd).max() < 5 * error
+    # The square of the bent coordinate has heavier tails than a normal one: twice the standard error of a deviation.
+    assert np.abs(flat.std(axis=0) / target.sd - 1).max() < 10 * error
+
+
+def test_a_surrogate_that_is_wrong_costs_acceptance_and_nothing_else() -> None:
+    target = Gaussian()
+    wrong = Gaussian()
+    wrong.mean = target.mean + 0.4 * np.linalg.cholesky(target.covariance).sum(axis=1)
+    random = np.random.RandomState(3)
+    points = StudentProposal(wrong.mean, wrong.covariance).draw(200, random)
+    values = np.array([wrong(point) for point in points])
+    surrogate = Surrogate(target.prior, points, values, wrong.mean, wrong.covariance)
+    sampler = emcee.EnsembleSampler(50, 5, target, moves=emcee.moves.MHMove(surrogate))
+    sampler.run_mcmc(emcee.State(points[:50], random_state=random.get_state()), 400, skip_initial_state_check=True)
+    chain = sampler.get_chain(discard=50)
+    assert 0.1 < sampler.acceptance_fraction.mean() < 0.8
+    error = math.sqrt(autocorrelation_time(chain) / (chain.shape[0] * chain.shape[1]))
+    sd = np.sqrt(np.diag(target.covariance))
+    flat = chain.reshape(-1, 5)
+    assert np.abs((flat.mean(axis=0) - target.mean) / sd).max() < 5 * error
+    assert np.abs(flat.std(axis=0) / sd - 1).max() < 5 * error
+
+
+def test_a_surrogate_knows_what_it_was_told_and_nothing_outside_the_prior() -> None:
+    target = Banana()
+    known = Recorded(target)
+    laplace = find_optimum(target, target.mean + 0.3, np.eye(7))
+    surrogate = learn_surrogate(known, target.prior, laplace, np.random.RandomState(0))
+    points, values = np.array(known.points), np.array(known.values)
+    near = values > values.max() - 7.0
+    # It ends its lessons at an error of 0.35 at places that it does not know yet.
+    assert np.abs(surrogate.ln_density(points[near]) - values[near]).max() < 0.35
+    assert surrogate.ln_density(np.full((1, 7), 60.0))[0] == -math.inf
+    ends, _, _ = surrogate.walk(points[:9], 20, np.random.RandomState(1))
+    assert all(target.prior.holds(end) for end in ends)
+
+
+def test_a_target_that_is_nothing_wherever_it_is_asked_is_refused() -> None:
+    target = Gaussian()
+    laplace = Laplace(target.mean, target.covariance, 0.0, 1)
+
+    class Nothing(Gaussian):
+        def __call__(self, values: np.ndarray) -> float:
+            return -math.inf
+
+    with pytest.raises(PosteriorError, match="nothing anywhere"):
+        run_chain(Nothing(), laplace, walkers=8, max_steps=50, rng=np.random.default_rng(0))
+    target.prior = Prior.flat(target.prior.names, target.mean + 500.0, target.mean + 1e3)
+    known = find_optimum(Gaussian(), target.mean, np.eye(5))
+    with pytest.raises(PosteriorError, match="outside the prior"):
+        run_chain(target, known, walkers=8, max_steps=50, rng=np.random.default_rng(0))
+
+
+def test_a_chain_that_is_stuck_is_a_lesson_and_begins_anew() -> None:
+    # A second hill that neither the approximation nor the first surrogate knows.
+    class Hills(Gaussian):
+        def __call__(self, values: np.ndarray) -> float:
+            away = values - self.mean - 5.0 * np.sqrt(np.diag(self.covariance)) * np.eye(5)[0]
+            return float(np.logaddexp(super().__call__(values), -0.5 * away @ self.inverse @ away))
+
+    target = Hills()
+    laplace = Laplace(target.mean, target.covariance, 0.0, 1)
+    seen: list[float] = []
+    chain = run_chain(
+        target, laplace, walkers=12, max_steps=600, length=30.0, rng=np.random.default_rng(2), progress=seen.append
+    )
+    assert 0.0 < min(seen) <= max(seen) <= 1.0
+    assert chain.summary.evaluations >= chain.summary.walkers * (chain.summary.steps + chain.summary.burn_in) - 6
 
 
 def test_the_same_seed_gives_the_same_chain() -> None:
