@@ -85,7 +85,8 @@ def run_chain(
 ) -> Chain:
     """Sample the target until the chain is ``length`` autocorrelation times long, or ``max_steps`` are spent.
 
-    Fewer walkers than twice the parameters cannot follow each other: they walk on the surrogate alone.
+    Fewer walkers than twice the parameters cannot follow each other: they walk on the surrogate alone. A chain that
+    sticks teaches the surrogate and begins anew; what it had is burn-in.
 
     Raises
     ------
@@ -98,7 +99,6 @@ def run_chain(
         known = Recorded(target, list(laplace.known[0]), laplace.known[1].tolist())
     before = target.evaluations
     sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random)
-    burn_in = round((target.evaluations - before) / walkers)
     tau, steps, left = math.inf, 0, _LESSONS
     while steps < max_steps and steps < length * tau:
         state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
@@ -106,8 +106,8 @@ def run_chain(
         tau = autocorrelation_time(sampler.get_chain())
         if progress is not None:
             progress(min(1.0, steps / min(float(max_steps), length * tau)))
-        if left and steps >= _LESSON_STEPS and length * (tau - _USUAL_TAU) > 2.0 * steps:
-            left, burn_in = left - 1, burn_in + steps
+        if left and _LESSON_STEPS <= steps < max_steps and length * (tau - _USUAL_TAU) > 2.0 * steps:
+            left -= 1
             for values, found in zip(state.coords, state.log_prob, strict=True):
                 known.remember(values, float(found))
             sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random)
@@ -119,7 +119,7 @@ def run_chain(
         status=status,
         walkers=walkers,
         steps=steps,
-        burn_in=burn_in,
+        burn_in=round((target.evaluations - before) / walkers) - steps,
         tau=tau,
         effective_samples=steps * walkers / tau,
         acceptance=float(np.mean(sampler.acceptance_fraction)),

@@ -148,21 +148,47 @@ def test_a_target_that_is_nothing_wherever_it_is_asked_is_refused() -> None:
         run_chain(target, known, walkers=8, max_steps=50, rng=np.random.default_rng(0))
 
 
-def test_a_chain_that_is_stuck_is_a_lesson_and_begins_anew() -> None:
-    # A second hill that neither the approximation nor the first surrogate knows.
-    class Hills(Gaussian):
-        def __call__(self, values: np.ndarray) -> float:
-            away = values - self.mean - 5.0 * np.sqrt(np.diag(self.covariance)) * np.eye(5)[0]
-            return float(np.logaddexp(super().__call__(values), -0.5 * away @ self.inverse @ away))
+class Hills:
+    """A normal hill, and three tenths of the weight on one half as wide, three deviations away."""
 
-    target = Hills()
-    laplace = Laplace(target.mean, target.covariance, 0.0, 1)
-    seen: list[float] = []
+    away, width, weight = 3.0, 0.5, 0.3
+
+    def __init__(self, dimensions: int = 5) -> None:
+        self.prior = Prior.flat(tuple("abcdefgh"[:dimensions]), np.full(dimensions, -30.0), np.full(dimensions, 30.0))
+        self.evaluations = 0
+
+    def __call__(self, values: np.ndarray) -> float:
+        self.evaluations += 1
+        other = (values - self.away * np.eye(values.size)[0]) / self.width
+        ln_other = math.log(self.weight) - values.size * math.log(self.width) - 0.5 * other @ other
+        return float(np.logaddexp(math.log(1.0 - self.weight) - 0.5 * values @ values, ln_other))
+
+
+def test_a_chain_that_sticks_is_a_lesson_and_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    lessons = []
+
+    def counted(known, prior, laplace, random):
+        lessons.append(len(known.values))
+        return learn_surrogate(known, prior, laplace, random)
+
+    monkeypatch.setattr("engine.posterior.chain.learn_surrogate", counted)
+    target, done = Hills(), []
     chain = run_chain(
-        target, laplace, walkers=12, max_steps=600, length=30.0, rng=np.random.default_rng(2), progress=seen.append
+        target, Laplace(np.zeros(5), np.eye(5), 0.0, 1), walkers=12, max_steps=600, rng=np.random.default_rng(1),
+        progress=done.append,
+    )  # fmt: skip
+    assert len(lessons) >= 2
+    # What the chain went through is what the surrogate learns from.
+    assert lessons[1] > lessons[0] + 12 * 60
+    summary = chain.summary
+    assert summary.status == "converged"
+    # Steps that were a lesson are burn-in: all evaluations are accounted for, to half a step of all walkers.
+    assert abs(summary.evaluations - summary.walkers * (summary.steps + summary.burn_in)) <= summary.walkers / 2
+    x = chain.flat()[:, 0]
+    assert x.mean() == pytest.approx(
+        target.weight * target.away, abs=5 * x.std() / math.sqrt(summary.effective_samples)
     )
-    assert 0.0 < min(seen) <= max(seen) <= 1.0
-    assert chain.summary.evaluations >= chain.summary.walkers * (chain.summary.steps + chain.summary.burn_in) - 6
+    assert all(0.0 < fraction <= 1.0 for fraction in done)
 
 
 def test_the_same_seed_gives_the_same_chain() -> None:
