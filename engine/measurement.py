@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from engine.conventions import position_angle, rate_to_magnitude
+from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
@@ -119,11 +119,15 @@ class ImageMeasurement:
 
     @property
     def inversion_chi2_per_dof(self) -> float | None:
-        """Of the inversion with the noise that the parametric fit takes, its misfit not counted; None without one."""
+        """Of the inversion, with the noise of ``chi2_per_dof`` where the exposures are not known; None without one."""
         if self.inversion is None:
             return None
-        counted = self.fit.misfit if self.observation.response is None else 1.0
-        return counted * self.inversion.chi2 / self.inversion.degrees_of_freedom
+        chi2 = self.inversion.chi2
+        if self.observation.response is None:
+            # The inversion takes what the fit misses for noise, which must not make the two incomparable.
+            residual = self.inversion.products.residual * self.observation.noise
+            chi2 = _chi2(self.observation, self.fit, residual, self.noise_scale)
+        return chi2 / self.inversion.degrees_of_freedom
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form, without the arrays."""
@@ -165,11 +169,11 @@ def measured(mean: float, sd: float) -> Measured:
     return Measured(mean, sd, (mean - _NORMAL_95 * sd, mean + _NORMAL_95 * sd))
 
 
-def _chi2(observation: Observation, fit: ParametricFit, scale: float) -> float:
-    """chi^2 with the noise map times ``scale`` and the error of the AGN's light as it is."""
+def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, scale: float) -> float:
+    """chi^2 of residuals (ny, nx) with the noise map times ``scale`` and the error of the AGN's light as it is."""
     used = np.isfinite(fit.sigma)
     variance = fit.sigma[used] ** 2 + (scale**2 - 1.0) * observation.noise[used] ** 2
-    return float(np.sum((observation.image - fit.model)[used] ** 2 / variance))
+    return float(np.sum(residual[used] ** 2 / variance))
 
 
 def _parametric_estimate(fit: ParametricFit, zero_point: float, inflation: float) -> HostEstimate:
@@ -282,8 +286,9 @@ def measure_image(
                 )
             except (PosteriorError, InversionError, ObservationError) as error:
                 warnings.append(f"inversion: {error}")
-    scale = noise_scale(observation, observation.image - fit.model, fit.sigma, fit.lens)
-    chi2 = _chi2(observation, fit, scale) / fit.degrees_of_freedom
+    residual = observation.image - fit.model
+    scale = noise_scale(observation, residual, fit.sigma, fit.lens)
+    chi2 = _chi2(observation, fit, residual, scale) / fit.degrees_of_freedom
     if abs(scale - 1.0) > _NOISE_AGREES:
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")
     # Where the map is too large the errors keep it: its excess stands for the noise that neighbouring pixels share.

@@ -55,6 +55,19 @@ def test_an_image_is_measured_without_being_told_what_is_in_it(simulation: Simul
     assert "gamma1" not in found.lens, "the lens has no shear, and the data do not ask for any"
 
 
+def test_fit_and_inversion_tell_their_chi2_in_the_same_noise(simulation: Simulation) -> None:
+    # A noise map of half the noise, exposures unknown: to the inversion the rest is what the fit misses.
+    seen = simulation.observation
+    halved = replace(seen, noise=0.5 * seen.noise, response=None, covariance=None)
+    found = measure_image(halved, agn_images=len(simulation.scene.agn), shear=False, profile="draft")
+    assert found.noise_scale == pytest.approx(2.0, abs=0.15)
+    assert found.chi2_per_dof_as_given > 2.0
+    # Both describe the image; what errors of stamps are allowed for makes them smaller than one.
+    assert 0.7 < found.chi2_per_dof < 1.2
+    # Its ring has the AGN in it and not the sky: 1.3 where the fit has 1.1. In another noise it would be four times that.
+    assert found.inversion_chi2_per_dof == pytest.approx(found.chi2_per_dof, abs=0.4)
+
+
 def test_an_arc_without_agn_is_found_from_its_ring() -> None:
     system = replace(load_system("HE0435"), agn=())
     realization = Realization(system=system, l_eta=1.0, host=Host(n=1.5, r_eff=0.3, magnitude=21.0))
