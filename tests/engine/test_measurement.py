@@ -64,7 +64,7 @@ def test_fit_and_inversion_tell_their_chi2_in_the_same_noise(simulation: Simulat
     assert found.chi2_per_dof_as_given > 2.0
     # Both describe the image; what errors of stamps are allowed for makes them smaller than one.
     assert 0.7 < found.chi2_per_dof < 1.2
-    # Its ring has the AGN in it and not the sky: 1.3 where the fit has 1.1. In another noise it would be four times that.
+    # Its ring has the AGN in it and not the sky: 1.3 where the fit has 1.1. In another noise: four times that.
     assert found.inversion_chi2_per_dof == pytest.approx(found.chi2_per_dof, abs=0.4)
 
 
