@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 from engine import Analysis, EngineError, Host, Realization, load_system, measure, simulate_realization
 from engine.conventions import FloatArray, rate_to_magnitude
@@ -77,15 +78,16 @@ def calibrate(seed: int, profile: str) -> dict[str, Any]:
     realization = drawn_realization(seed, profile)
     record: dict[str, Any] = {"seed": seed, "engine": engine_digest(), "profile": profile}
     try:
-        simulation = simulate_realization(realization)
-        scene = simulation.scene
-        found = measure(
-            simulation.observation,
-            realization.analysis,
-            np.random.default_rng([20172, seed]),
-            agn_images=len(scene.agn),
-            truth=Truth(scene.lens, scene.host),
-        )
+        with threadpool_limits(1):
+            simulation = simulate_realization(realization)
+            scene = simulation.scene
+            found = measure(
+                simulation.observation,
+                realization.analysis,
+                np.random.default_rng([20172, seed]),
+                agn_images=len(scene.agn),
+                truth=Truth(scene.lens, scene.host),
+            )
     except EngineError as error:
         return {**record, "error": str(error)}
     zero_point = scene.camera.zero_point
