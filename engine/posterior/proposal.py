@@ -15,10 +15,6 @@ class StudentProposal:
     """Multivariate t of a mean (d,) and covariance (d, d) of its Gaussian core; emcee's protocol of proposals."""
 
     def __init__(self, mean: FloatArray, covariance: FloatArray) -> None:
-        self.update(mean, covariance)
-
-    def update(self, mean: FloatArray, covariance: FloatArray) -> None:
-        """Propose from another mean and covariance from now on."""
         self.mean = mean
         self.root = np.linalg.cholesky(covariance)
         self._inverse = np.linalg.inv(self.root)

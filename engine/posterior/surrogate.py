@@ -4,8 +4,8 @@ The surrogate is the Student density of the Gaussian approximation times the exp
 what ln of the target differs from it by: it follows a posterior that bends, and far from all that is known it is the
 Student density. A walk on it costs next to nothing. Where a walk ends is a proposal that the target then accepts with
 probability min(1, pi(y) s(x) / (pi(x) s(y))) (delayed acceptance: Christen & Fox 2005): each step of the walk is
-reversible with regard to the surrogate s and so is the walk, which leaves the target pi invariant however wrong the
-surrogate is. A wrong one costs acceptance.
+reversible with regard to the surrogate s, which may be a warmer one, and so is the walk. That leaves the target pi
+invariant however wrong the surrogate is; a wrong one costs acceptance.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 
 from engine.conventions import FloatArray
@@ -67,9 +68,12 @@ class Surrogate:
 
     def ln_density(self, states: FloatArray) -> FloatArray:
         """What it takes ln of the target (n,) to be at states (n, d); minus infinity outside the prior."""
-        inside = ((states > self.prior.low) & (states < self.prior.high)).all(axis=1)
         found = self._level + self.proposal.ln_density(states) + self._process(self.proposal.whiten(states))
-        return np.where(inside, found, -np.inf)
+        return np.where(self._inside(states), found, -np.inf)
+
+    def _inside(self, states: FloatArray) -> NDArray[np.bool_]:
+        """Which of the states (n, d) the prior holds."""
+        return np.asarray(((states > self.prior.low) & (states < self.prior.high)).all(axis=1))
 
     def walk(
         self, states: FloatArray, steps: int, random: np.random.RandomState, temperature: float = 1.0
@@ -103,7 +107,7 @@ class Surrogate:
             The Gaussian approximation lies outside the prior.
         """
         start = self.proposal.draw(50 * number, random)
-        start = start[np.isfinite(self.ln_density(start))][:number]
+        start = start[self._inside(start)][:number]
         if start.shape[0] < number:
             raise PosteriorError("chain: the Gaussian approximation lies outside the prior")
         return self.walk(start, _LONG_WALK, random)[0]
