@@ -3,6 +3,7 @@
 This module is the engine's public face: everything that ``service`` or a user may import.
 """
 
+from engine.acceptance import check_realization
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
 from engine.catalogue.user_files import read_camera, read_mapping, read_system
 from engine.digest import engine_digest, engine_versions
@@ -14,12 +15,25 @@ from engine.errors import (
     PosteriorError,
     SpecError,
 )
-from engine.grid import Grid, GridRun, expand, preset_names
+from engine.grid import (
+    FirstSeed,
+    Grid,
+    GridRun,
+    Indices,
+    Magnitudes,
+    Radii,
+    Replicates,
+    Slopes,
+    Systems,
+    expand,
+    preset_names,
+)
 from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.foreign import NoiseFromImage, observation_from_arrays
 from engine.imaging.foreign_files import read_foreign_observation
 from engine.imaging.observation import Observation
 from engine.inspection import InversionView, inspect_inversion, inspect_simulation
+from engine.json_text import read_json
 from engine.measurement import HostEstimate, ImageMeasurement, Measured, measure_image
 from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, measure, run
@@ -32,6 +46,7 @@ from engine.spec import (
     Camera,
     CameraChoice,
     Host,
+    Identifier,
     LensSystem,
     NoiseLevel,
     Optics,
@@ -43,9 +58,10 @@ from engine.spec import (
     spec_digest,
     system_from_mapping,
 )
-from engine.validation import field_steps, spec_error
+from engine.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 
 __all__ = [
+    "PRINTABLE",
     "PROFILES",
     "STAGES",
     "Analysis",
@@ -55,16 +71,20 @@ __all__ = [
     "ChainSummary",
     "EngineError",
     "Estimate",
+    "FirstSeed",
     "Grid",
     "GridRun",
     "Host",
     "HostEstimate",
+    "Identifier",
     "ImageMeasurement",
+    "Indices",
     "InversionError",
     "InversionView",
     "LensEquationError",
     "LensParameter",
     "LensSystem",
+    "Magnitudes",
     "Measured",
     "Measurement",
     "NoiseFromImage",
@@ -76,21 +96,27 @@ __all__ = [
     "PosteriorError",
     "Products",
     "Quantity",
+    "Radii",
     "Realization",
+    "Replicates",
     "RunResult",
     "Simulation",
+    "Slopes",
     "SpecError",
     "StageTime",
     "SystemChoice",
+    "Systems",
     "Truth",
     "camera_from_mapping",
     "camera_names",
     "check_analysis",
+    "check_realization",
     "check_system",
+    "complaint",
     "engine_digest",
     "engine_versions",
     "expand",
-    "field_steps",
+    "field_path",
     "generator",
     "inspect_inversion",
     "inspect_simulation",
@@ -99,9 +125,11 @@ __all__ = [
     "measure",
     "measure_image",
     "observation_from_arrays",
+    "path_steps",
     "preset_names",
     "read_camera",
     "read_foreign_observation",
+    "read_json",
     "read_mapping",
     "read_observation",
     "read_system",

@@ -6,6 +6,21 @@ all three to the person who asked. Nothing in the engine returns a sentinel numb
 
 from __future__ import annotations
 
+_LONGEST_VALUE = 80
+
+
+def shown(value: object) -> object:
+    """A value to be repeated in a message, or what it is where that would be too long."""
+    if isinstance(value, int) and value.bit_length() > 4 * _LONGEST_VALUE:
+        return f"a number of {value.bit_length()} bits"
+    if (isinstance(value, dict | list | tuple) and len(value) > _LONGEST_VALUE) or len(repr(value)) > _LONGEST_VALUE:
+        if isinstance(value, dict):
+            return f"a table of {len(value)} fields"
+        if isinstance(value, list | tuple):
+            return f"a list of {len(value)} entries"
+        return f"{str(value)[:_LONGEST_VALUE]}..."
+    return value
+
 
 class EngineError(Exception):
     """Base of every error that the engine raises on purpose."""
@@ -15,7 +30,7 @@ class SpecError(EngineError, ValueError):
     """A specification is not acceptable: which field, which value, what is allowed."""
 
     def __init__(self, field: str, value: object, allowed: str) -> None:
-        super().__init__(f"{field}: got {value!r}, allowed is {allowed}")
+        super().__init__(f"{field}: got {shown(value)!r}, allowed is {allowed}")
         self.field = field
         self.value = value
         self.allowed = allowed

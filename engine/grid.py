@@ -9,11 +9,22 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from engine.catalogue import load_camera, load_dither, load_system, read_catalogue
+from engine.catalogue import (
+    camera_names,
+    dither_names,
+    load_camera,
+    load_dither,
+    load_system,
+    read_catalogue,
+    system_names,
+)
 from engine.errors import SpecError
 from engine.spec import (
     Analysis,
+    Camera,
     CameraChoice,
+    Count,
+    Dither,
     Host,
     Identifier,
     LensSystem,
@@ -23,11 +34,22 @@ from engine.spec import (
     Radius,
     Realization,
     SersicIndex,
+    Slope,
     SystemChoice,
 )
 
 PAPER = "h0licow-vi"
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
+_SOME = Field(max_length=1000)
+
+Systems = Annotated[tuple[SystemChoice, ...], _SOME]
+Indices = Annotated[tuple[SersicIndex, ...], _SOME]
+Radii = Annotated[tuple[Radius, ...], _SOME]
+Magnitudes = Annotated[tuple[Magnitude, ...], _SOME]
+Slopes = Annotated[tuple[Slope, ...], _SOME]
+# Below the greatest seed of a realization by more than the replicates, which count on from here.
+FirstSeed = Annotated[Count, Field(ge=0, le=2**62)]
+Replicates = Annotated[Count, Field(ge=1, le=100_000)]
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -42,16 +64,16 @@ class Grid:
     """
 
     preset: Identifier | None = None
-    systems: tuple[SystemChoice, ...] | None = None
-    n: tuple[SersicIndex, ...] | None = None
-    r_eff: tuple[Radius, ...] | None = None
-    magnitude: tuple[Magnitude, ...] | None = None
-    l_eta: tuple[float, ...] | None = None
+    systems: Systems | None = None
+    n: Indices | None = None
+    r_eff: Radii | None = None
+    magnitude: Magnitudes | None = None
+    l_eta: Slopes | None = None
     mass_model: Identifier = "recommended"
     noise_level: NoiseLevel = "author"
     optics: Optics | None = None
-    seed: Annotated[int, Field(ge=0, le=2**62)] = 0
-    replicates: Annotated[int, Field(ge=1, le=100_000)] = 1
+    seed: FirstSeed = 0
+    replicates: Replicates = 1
     analysis: Analysis = Field(default_factory=Analysis)
     camera: CameraChoice | None = None
 
@@ -72,6 +94,7 @@ def preset_names() -> tuple[str, ...]:
 
 def expand(grid: Grid) -> tuple[GridRun, ...]:
     """All runs of a grid in a fixed order; a SpecError says which value is not allowed and what is."""
+    _require_own_names(grid)
     points = _paper_points(grid) if grid.preset is not None else _free_points(grid)
     _require_known_parts(grid, points)
     runs = []
@@ -96,6 +119,26 @@ def expand(grid: Grid) -> tuple[GridRun, ...]:
 
 
 _Point = tuple[str | LensSystem, int | None, Host, float]
+
+
+def _require_own_names(grid: Grid) -> None:
+    """What is one's own has a name of its own: results are told apart by the names of system and camera."""
+    _require_own_camera(grid.camera, "camera")
+    for place, system in enumerate(grid.systems or ()):
+        if not isinstance(system, LensSystem):
+            continue
+        where = f"systems[{place}]"
+        if system.name in system_names():
+            raise SpecError(f"{where}.name", system.name, "a name that the catalogue does not have")
+        _require_own_camera(system.camera, f"{where}.camera")
+        dither = system.exposures.dither
+        if isinstance(dither, Dither) and dither.name in dither_names():
+            raise SpecError(f"{where}.exposures.dither.name", dither.name, "a name that the catalogue does not have")
+
+
+def _require_own_camera(camera: str | Camera | None, where: str) -> None:
+    if isinstance(camera, Camera) and camera.name in camera_names():
+        raise SpecError(f"{where}.name", camera.name, "a name that the catalogue does not have")
 
 
 def _require_known_parts(grid: Grid, points: Sequence[_Point]) -> None:

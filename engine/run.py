@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from engine.acceptance import check_realization
 from engine.catalogue import load_system
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
@@ -31,7 +32,7 @@ from engine.modelling.parametric import ParametricFit, fit_parametric
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
-from engine.posterior.target import Target, wide_prior
+from engine.posterior.target import TYPICAL_LN_LAMBDA, Target, wide_prior
 from engine.refits.draws import DrawSet, source_draw
 from engine.refits.estimators import refit_draws
 from engine.refits.profiles import profile_on_grid
@@ -47,15 +48,12 @@ from engine.result import (
     RunResult,
     StageTime,
 )
-from engine.scene import check_analysis
 from engine.seeds import generator
 from engine.simulation import simulate_realization
 from engine.spec import NOMINAL_OPTICS, Analysis, Realization
 
 Progress = Callable[[str, float], None]
 STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
-_TYPICAL_LN_LAMBDA = -10.0
-"""Middle of the interval that is searched for ln lambda, 40 wide: lambda has units, but no scene strays that far."""
 
 
 @dataclass
@@ -185,7 +183,7 @@ def prepare_target(problem: Problem, fit: ParametricFit, analysis: Analysis, *, 
         analysis.source_softening,
         analysis.regularisation_length,
     )
-    prior = wide_prior(fit.lens, _TYPICAL_LN_LAMBDA, shear=shear).restricted(analysis.priors)
+    prior = wide_prior(fit.lens, TYPICAL_LN_LAMBDA, shear=shear).restricted(analysis.priors)
     anchors = problem.operator.rays.anchors
     agn = None
     if analysis.agn_position_sd is not None:
@@ -317,7 +315,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
     EngineError
         The run has no trustworthy result; the message says why.
     """
-    check_analysis(realization)
+    check_realization(realization)
     watch = _Stopwatch(progress)
     # One thread: a worker is given one core, and sums in a fixed order give the same bits everywhere.
     with threadpool_limits(1):

@@ -17,13 +17,24 @@ from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
 from engine.errors import SpecError
-from engine.validation import NAME_TAG, OBJECT_TAG, name_or_object, spec_error
+from engine.validation import (
+    DECIMAL,
+    IDENTIFIER,
+    NAME_TAG,
+    OBJECT_TAG,
+    PRINTABLE,
+    field_path,
+    name_or_object,
+    spec_error,
+)
 
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
-# Strict, or a file's true would be the number 1 and its "20.5" a number.
+# Strict, or a file's true would be the number 1 and its "20.5" a number. What stands here is the one statement of what
+# is allowed: files, grids and the API's schema are made of these types.
 Number = Annotated[float, Strict()]
 Count = Annotated[int, Strict()]
+Flag = Annotated[bool, Strict()]
 AxisRatio = Annotated[Number, Field(ge=0.05, le=1.0)]
 Angle = Annotated[Number, Field(ge=-360.0, le=360.0)]
 Magnitude = Annotated[Number, Field(ge=5.0, le=40.0)]
@@ -31,18 +42,24 @@ SersicIndex = Annotated[Number, Field(ge=0.3, le=10.0)]
 Radius = Annotated[Number, Field(gt=1e-4, le=60.0)]
 Coordinate = Annotated[Number, Field(ge=-60.0, le=60.0)]
 Position = tuple[Coordinate, Coordinate]
-Positive = Annotated[Number, Field(gt=0.0)]
-NotNegative = Annotated[Number, Field(ge=0.0)]
+Positive = Annotated[Number, Field(gt=0.0, le=1e9)]
+NotNegative = Annotated[Number, Field(ge=0.0, le=1e9)]
+Bound = Annotated[Number, Field(ge=-1e6, le=1e6)]
+PupilCoordinate = Annotated[Number, Field(ge=-2.0, le=2.0)]
+Waves = Annotated[Number, Field(ge=-10.0, le=10.0)]
+Slope = Annotated[Number, Field(ge=0.2, le=1.8)]
+Seed = Annotated[Count, Field(ge=0, le=2**63 - 1)]
 Fraction = Annotated[Number, Field(ge=0.0, lt=1.0)]
-Scale = Annotated[Number, Field(gt=0.0, le=1.0)]
+Scale = Annotated[Number, Field(gt=0.0001, le=1.0)]
 Shear = Annotated[Number, Field(ge=-0.7, le=0.7)]
 Shift = Annotated[Count, Field(ge=-64, le=64)]
-ZernikeTerm = Annotated[Count, Field(ge=1, le=200)]
+ZernikeTerm = Literal[4, 5, 6, 7, 8, 9, 10, 11, 22]
 KernelRow = tuple[NotNegative, NotNegative, NotNegative]
 RightAscension = Annotated[Number, Field(ge=0.0, lt=360.0)]
 Declination = Annotated[Number, Field(ge=-90.0, le=90.0)]
 Exposure = Annotated[Number, Field(gt=0.0, le=1e5)]
-Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$")]
+Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=IDENTIFIER)]
+SlopeKey = Annotated[str, Field(pattern=DECIMAL)]
 NoiseLevel = Literal["author", "handbook"]
 ProfileName = Literal["draft", "standard", "reference", "paper"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
@@ -60,19 +77,19 @@ class ParameterPrior:
     frame of :mod:`engine.conventions`.
     """
 
-    low: Number | None = None
-    high: Number | None = None
-    mean: Number | None = None
+    low: Bound | None = None
+    high: Bound | None = None
+    mean: Bound | None = None
     sd: Positive | None = None
 
     @model_validator(mode="after")
     def _says_something(self) -> ParameterPrior:
         if (self.mean is None) != (self.sd is None):
-            raise SpecError("mean, sd", (self.mean, self.sd), "both or neither")
+            raise SpecError("", (self.mean, self.sd), "mean, sd: both or neither")
         if self.low is None and self.high is None and self.mean is None:
-            raise SpecError("low, high, mean, sd", None, "a bound, or a mean with its sd")
+            raise SpecError("", None, "low, high, mean, sd: a bound, or a mean with its sd")
         if self.low is not None and self.high is not None and not self.low < self.high:
-            raise SpecError("low, high", (self.low, self.high), "a lower bound below the upper")
+            raise SpecError("", (self.low, self.high), "low, high: the lower bound below the upper")
         return self
 
 
@@ -88,7 +105,7 @@ class MassModel:
     behind the lens [arcsec].
     """
 
-    theta_E: Annotated[Number, Field(gt=0.0, le=30.0)]
+    theta_E: Annotated[Number, Field(gt=0.001, le=30.0)]
     q: AxisRatio
     position_angle: Angle
     slope: Annotated[Number, Field(ge=1.2, le=2.8)]
@@ -113,7 +130,7 @@ class SersicLight:
 class AgnImage:
     """One image of the AGN: its name, its observed position [arcsec] and its AB magnitude."""
 
-    name: Annotated[str, Field(min_length=1, max_length=8)]
+    name: Annotated[str, Field(min_length=1, max_length=8, pattern=PRINTABLE)]
     position: Position
     magnitude: Magnitude
 
@@ -171,10 +188,10 @@ class Pupil:
     primary_diameter_m: Annotated[Number, Field(gt=0.0, le=100.0)]
     secondary: Fraction
     spider_width: Fraction
-    pads: tuple[tuple[Number, Number, Fraction], ...]
+    pads: Annotated[tuple[tuple[PupilCoordinate, PupilCoordinate, Fraction], ...], Field(max_length=16)]
     rotation_deg: Angle
     cold_mask: ColdMask | None = None
-    zernike_waves_at_547nm: tuple[tuple[ZernikeTerm, Number], ...] = ()
+    zernike_waves_at_547nm: Annotated[tuple[tuple[ZernikeTerm, Waves], ...], Field(max_length=16)] = ()
 
 
 @dataclass(frozen=True, config=_STRICT)
@@ -199,7 +216,7 @@ class Camera:
     dark_e_s: NotNegative
     sky_e_s: NotNegative
     wavelength_nm: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=1000)]
-    throughput: tuple[NotNegative, ...]
+    throughput: Annotated[tuple[NotNegative, ...], Field(max_length=1000)]
     pupil: Pupil
     detector_kernel: tuple[KernelRow, KernelRow, KernelRow]
     noise_author: AuthorNoise | None = None
@@ -235,10 +252,12 @@ class LensSystem:
     name: Identifier
     camera: CameraChoice
     exposures: ExposurePlan
-    agn: tuple[AgnImage, ...]
+    agn: Annotated[tuple[AgnImage, ...], Field(max_length=16)]
     host_q: AxisRatio
     host_position_angle: Angle
-    mass_models: Annotated[dict[str, dict[str, MassModel]], Field(min_length=1)]
+    mass_models: Annotated[
+        dict[Identifier, Annotated[dict[SlopeKey, MassModel], Field(max_length=32)]], Field(min_length=1, max_length=32)
+    ]
     deflector: SersicLight | None = None
     coordinates: tuple[RightAscension, Declination] | None = None
     priors: Priors = Field(default_factory=dict)
@@ -250,12 +269,13 @@ class LensSystem:
             raise SpecError("agn", names, "images of different names")
         for model, by_slope in self.mass_models.items():
             if not by_slope:
-                raise SpecError(f"mass_models.{model}", by_slope, "a model for one l_eta at least")
+                raise SpecError(field_path(("mass_models", model)), by_slope, "a model for one l_eta at least")
             for key, mass in by_slope.items():
-                if not _is_number(key) or abs(float(key) + 1.0 - mass.slope) > _SLOPE_TOLERANCE:
-                    raise SpecError(
-                        f'mass_models.{model}["{key}"]', key, f"l_eta of its slope, {round(mass.slope - 1.0, 9)}"
-                    )
+                place = field_path(("mass_models", model, key))
+                if not abs(float(key) + 1.0 - mass.slope) <= _SLOPE_TOLERANCE:
+                    raise SpecError(place, key, f"l_eta of its slope, {round(mass.slope - 1.0, 9)}")
+                if any(other != key and abs(float(other) - float(key)) <= _SLOPE_TOLERANCE for other in by_slope):
+                    raise SpecError(place, key, "one model for each l_eta")
         return self
 
     @property
@@ -345,25 +365,25 @@ class Analysis:
     """
 
     profile: ProfileName = "standard"
-    source_pixels: tuple[Annotated[int, Field(ge=2, le=80)], Annotated[int, Field(ge=2, le=80)]] = (20, 20)
-    source_softening: Annotated[float, Field(gt=0.01, le=1e3)] | None = None
+    source_pixels: tuple[Annotated[Count, Field(ge=2, le=80)], Annotated[Count, Field(ge=2, le=80)]] = (20, 20)
+    source_softening: Annotated[Number, Field(gt=0.01, le=1e3)] | None = None
     regularisation: RegularisationName = "curvature"
-    regularisation_length: Annotated[float, Field(ge=0.1, le=100.0)] = 3.0
+    regularisation_length: Annotated[Number, Field(ge=0.1, le=100.0)] = 3.0
     noise_treatment: NoiseTreatment = "covariance"
-    mask_inner: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.4
-    mask_outer: Annotated[float, Field(gt=1.0, le=5.0)] = 1.65
-    core_radius: Annotated[float, Field(ge=0.0, le=2.0)] = 0.25
-    subrays: Annotated[int, Field(ge=1, le=8)] = 2
-    source_envelope: bool = True
-    ray_margin: Annotated[int, Field(ge=0, le=40)] = 4
-    psf_radius: Annotated[int, Field(ge=1, le=80)] = 15
-    walkers: Annotated[int, Field(ge=2, le=1000)] = 8
-    chain_length: Annotated[float, Field(ge=10.0, le=1e4)] = 100.0
-    max_steps: Annotated[int, Field(ge=10, le=200_000)] = 600
-    draws: Annotated[int, Field(ge=2, le=1000)] = 30
+    mask_inner: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.4
+    mask_outer: Annotated[Number, Field(gt=1.0, le=5.0)] = 1.65
+    core_radius: Annotated[Number, Field(ge=0.0, le=2.0)] = 0.25
+    subrays: Annotated[Count, Field(ge=1, le=8)] = 2
+    source_envelope: Flag = True
+    ray_margin: Annotated[Count, Field(ge=0, le=40)] = 4
+    psf_radius: Annotated[Count, Field(ge=1, le=80)] = 15
+    walkers: Annotated[Count, Field(ge=2, le=1000)] = 8
+    chain_length: Annotated[Number, Field(ge=10.0, le=1e4)] = 100.0
+    max_steps: Annotated[Count, Field(ge=10, le=200_000)] = 600
+    draws: Annotated[Count, Field(ge=2, le=1000)] = 30
     priors: Priors = Field(default_factory=dict)
-    agn_position_sd: Annotated[float, Field(ge=1e-5, le=1.0)] | None = None
-    background_sd: Annotated[float, Field(ge=1e-9, le=1e9)] | None = None
+    agn_position_sd: Annotated[Number, Field(ge=1e-5, le=1.0)] | None = None
+    background_sd: Annotated[Number, Field(ge=1e-9, le=1e9)] | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -390,9 +410,9 @@ class Realization:
     """
 
     system: SystemChoice
-    l_eta: Annotated[Number, Field(ge=0.2, le=1.8)]
+    l_eta: Slope
     host: Host
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    seed: Seed = 0
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
     camera: CameraChoice | None = None
@@ -464,14 +484,6 @@ def system_from_mapping(document: Mapping[str, Any]) -> LensSystem:
 def camera_from_mapping(document: Mapping[str, Any]) -> Camera:
     """Read a camera from its JSON or TOML form; a SpecError names the field that is wrong."""
     return _read(_CAMERA, document)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _read(adapter: TypeAdapter[_Read], document: Mapping[str, Any]) -> _Read:

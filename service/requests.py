@@ -9,21 +9,30 @@ import dataclasses
 import math
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, StringConstraints, create_model
+from pydantic import BaseModel, ConfigDict, StringConstraints, create_model
 
 from engine import (
+    PRINTABLE,
     Analysis,
     CameraChoice,
+    FirstSeed,
     Grid,
     GridRun,
+    Identifier,
+    Indices,
     LensEquationError,
     LensSystem,
+    Magnitudes,
     NoiseLevel,
     Optics,
+    Radii,
+    Realization,
+    Replicates,
+    Slopes,
     SpecError,
-    SystemChoice,
+    Systems,
     camera_names,
-    check_analysis,
+    check_realization,
     check_system,
     engine_digest,
     expand,
@@ -38,12 +47,6 @@ from service.schemas import CameraItem, EngineView, SystemItem, SystemView
 from service.store.grids import PlannedRun
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
-_PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
-_MAX_VALUES = 1000
-
-# Strict, or true would be the number 1 and "20.5" a number.
-Number = Annotated[float, Strict()]
-Identifier = Annotated[str, StringConstraints(max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$")]
 
 
 def _optional_fields() -> dict[str, Any]:
@@ -61,15 +64,8 @@ else:
     AnalysisBody = AnalysisRequest
 
 
-_SOME = Field(min_length=1, max_length=_MAX_VALUES)
-Indices = Annotated[list[Annotated[Number, Field(ge=0.3, le=10.0)]], _SOME]
-Radii = Annotated[list[Annotated[Number, Field(ge=1e-4, le=60.0)]], _SOME]
-Magnitudes = Annotated[list[Annotated[Number, Field(ge=5.0, le=40.0)]], _SOME]
-Slopes = Annotated[list[Annotated[Number, Field(ge=0.2, le=1.8)]], _SOME]
-
-
 class GridRequest(BaseModel):
-    """A grid of realizations.
+    """A grid of realizations: the engine's Grid, in its own types, with a name and a partial analysis.
 
     With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
     lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
@@ -79,9 +75,9 @@ class GridRequest(BaseModel):
 
     model_config = _CONFIG
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=_PRINTABLE)] | None = None
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=PRINTABLE)] | None = None
     preset: Identifier | None = None
-    systems: Annotated[list[SystemChoice], _SOME] | None = None
+    systems: Systems | None = None
     n: Indices | None = None
     r_eff: Radii | None = None
     magnitude: Magnitudes | None = None
@@ -90,8 +86,8 @@ class GridRequest(BaseModel):
     mass_model: Identifier = "recommended"
     optics: Optics | None = None
     camera: CameraChoice | None = None
-    seed: Annotated[int, Strict(), Field(ge=0, le=2**62)] = 0
-    replicates: Annotated[int, Strict(), Field(ge=1, le=100_000)] = 1
+    seed: FirstSeed = 0
+    replicates: Replicates = 1
     analysis: AnalysisBody | None = None
 
     def canonical(self) -> dict[str, Any]:
@@ -120,11 +116,11 @@ def plan(request: GridRequest, max_runs: int) -> list[PlannedRun]:
     lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
     if request.preset is None:
         _limit(math.prod(len(values or ()) for values in lists) * request.replicates, max_runs)
+    _check_own_systems(request)
     single = expand(_grid(request, replicates=1))
     _limit(len(single) * request.replicates, max_runs)
-    _check_own_systems(request)
     for run in single:
-        check_analysis(run.realization)
+        _check(request, run.realization)
     runs = single if request.replicates == 1 else expand(_grid(request, request.replicates))
     return [_planned(run) for run in runs]
 
@@ -139,12 +135,24 @@ def _check_own_systems(request: GridRequest) -> None:
             try:
                 check_system(system)
             except SpecError as error:
-                raise SpecError(f"systems[{place}].{error.field}", error.value, error.allowed) from error
+                field = "exposures.dither" if error.field == "dither" else error.field
+                raise SpecError(f"systems[{place}].{field}", error.value, error.allowed) from error
             except LensEquationError as error:
                 models = f"systems[{place}].mass_models"
                 raise SpecError(
                     models, sorted(system.mass_models), f"lenses whose images can be found: {error}"
                 ) from error
+
+
+def _check(request: GridRequest, realization: Realization) -> None:
+    """Refuse a realization that no run could end well with, by the place in the request that makes it so."""
+    try:
+        check_realization(realization)
+    except SpecError as error:
+        own = error.field.startswith("system.")
+        place = (request.systems or ()).index(realization.system) if own else 0
+        field = f"systems[{place}].{error.field.removeprefix('system.')}" if own else error.field
+        raise SpecError(field, error.value, error.allowed) from error
 
 
 def _limit(runs: int, allowed: int) -> None:

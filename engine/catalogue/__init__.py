@@ -41,6 +41,11 @@ def camera_names() -> tuple[str, ...]:
     return tuple(read_catalogue("cameras")["cameras"])
 
 
+def dither_names() -> tuple[str, ...]:
+    """Names of the catalogue's dither patterns."""
+    return tuple(read_catalogue("cameras")["dithers"])
+
+
 def system_facts(name: str) -> dict[str, Any]:
     """Everything the catalogue holds of a system, with source and confidence of each group."""
     systems = read_catalogue("systems")["systems"]

@@ -5,12 +5,12 @@ The one place where the engine's specifications meet files that somebody else wr
 
 from __future__ import annotations
 
-import json
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from engine.errors import SpecError
+from engine.json_text import read_json
 from engine.scene import check_system
 from engine.spec import Camera, LensSystem, camera_from_mapping, system_from_mapping
 
@@ -49,18 +49,11 @@ def read_mapping(path: str | Path) -> dict[str, Any]:
         raise SpecError("file", path.name, "a file that ends in .toml or .json")
     try:
         text = path.read_text(encoding="utf-8")
-        document = tomllib.loads(text) if kind == ".toml" else json.loads(text, object_pairs_hook=_without_repetition)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        document = tomllib.loads(text) if kind == ".toml" else read_json(text)
+    except SpecError:
+        raise
+    except (ValueError, RecursionError) as error:  # not UTF-8; not TOML, or TOML whose numbers or nesting have no end
         raise SpecError("file", path.name, f"valid {kind[1:].upper()} ({error})") from error
     if not isinstance(document, dict):
         raise SpecError("file", path.name, "a table of fields")
     return document
-
-
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object; the json module would keep the last of two fields of one name without a word."""
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise SpecError(next(name for name in names if names.count(name) > 1), "two values", "one")
-    return table

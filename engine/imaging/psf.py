@@ -68,7 +68,7 @@ def telescope_psf(
     factor = camera.oversampling if oversampling is None else oversampling
     scale = camera.pixel_scale / factor
     size = 2 * round((field_of_view / scale - 1) / 2) + 1
-    nyquist = min(camera.wavelength_nm) * _nm_to_lambda_over_d(camera) / 2
+    nyquist = coarsest_subpixel(camera)
     if scale > nyquist or size < 3:
         allowed = f"sub-pixels below {nyquist:.4f} arcsec and a stamp of at least 3"
         raise SpecError("oversampling", factor, allowed)
@@ -81,6 +81,11 @@ def telescope_psf(
         jitter=float(jitter),
         pupil_pixels=pupil_pixels,
     )
+
+
+def coarsest_subpixel(camera: Camera) -> float:
+    """Side [arcsec] beyond which sub-pixels do not sample the shortest wavelength: lambda / 2D."""
+    return min(camera.wavelength_nm) * _nm_to_lambda_over_d(camera) / 2
 
 
 def _nm_to_lambda_over_d(camera: Camera) -> float:

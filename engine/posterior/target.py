@@ -20,6 +20,8 @@ from engine.spec import LensParameterName, ParameterPrior
 LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")
 SHEAR_NAMES = ("gamma1", "gamma2")
 STRENGTH = "ln_lambda"
+TYPICAL_LN_LAMBDA = -10.0
+"""Middle of the interval that is searched for ln lambda, 40 wide: lambda has units, but no scene strays that far."""
 
 
 # What the lens model can be at all; priors that are asked for end here.

@@ -12,6 +12,7 @@ from service import VERSION
 from service.api import catalogue, events, grids, health, problems
 from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
+from service.api.methods import Head
 from service.api.metrics import Measured
 from service.schemas import Problem
 from service.settings import Settings
@@ -66,6 +67,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes)
+    app.add_middleware(Head)
     # Last added is outermost: refused bodies are requests too.
     app.add_middleware(Measured, metrics=context.metrics)
     problems.install(app)

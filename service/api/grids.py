@@ -10,6 +10,7 @@ from fastapi.responses import JSONResponse
 from pydantic_core import to_json
 
 from engine import engine_digest
+from service.api.bodies import JsonRoute
 from service.api.context import GridId, Limit, RunId, Service
 from service.api.pages import next_link
 from service.identifiers import GRID_PATTERN
@@ -19,7 +20,7 @@ from service.store.grids import NotFoundError
 from service.store.states import RunState
 from service.store.summary import summarise
 
-router = APIRouter(prefix="/v1", tags=["grids"])
+router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
 _LOG = logging.getLogger(__name__)
 IdempotencyKey = Annotated[
     str | None,

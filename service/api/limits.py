@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any, Literal
+
 from fastapi import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from engine import SpecError
 from service.api.problems import InvalidRequestError, problem
+
+# As JSON writes them.
+_NUMBERS = {
+    "integer": (re.compile(r"-?(0|[1-9][0-9]*)"), "a whole number in plain digits"),
+    "number": (re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][-+]?[0-9]+)?"), "a number in plain digits"),
+}
 
 
 class BodyLimit:
@@ -59,17 +69,28 @@ def _replay(body: bytes, receive: Receive) -> Receive:
 
 
 def known_parameters(request: Request) -> None:
-    """Refuse query parameters that the endpoint does not document, and ones given twice.
+    """Refuse query parameters that the endpoint does not document, and what is given twice or is no plain number.
 
-    A misspelt filter that is ignored would answer with everything, which looks like an answer.
+    A misspelt filter that is ignored would answer with everything, which looks like an answer. Of a header that is
+    given twice FastAPI would take the first, of numbers also ``1_0``, `` 10`` and the digits of any script.
     """
     route = request.scope["route"]
     operation = request.app.openapi()["paths"][route.path][request.method.lower()]
-    known = {found["name"] for found in operation.get("parameters", ()) if found["in"] == "query"}
-    seen = set()
-    for name, _ in request.query_params.multi_items():
+    documented = operation.get("parameters", ())
+    known = {found["name"]: found["schema"] for found in documented if found["in"] == "query"}
+    headers = {found["name"]: found["schema"] for found in documented if found["in"] == "header"}
+    for name in request.query_params:
         if name not in known:
             raise InvalidRequestError("query", name, f"unknown parameter; known are {sorted(known)}")
-        if name in seen:
-            raise InvalidRequestError("query", name, "given more than once")
-        seen.add(name)
+        _require_one("query", name, request.query_params.getlist(name), known[name])
+    for name, schema in headers.items():
+        _require_one("header", name, request.headers.getlist(name), schema)
+
+
+def _require_one(source: Literal["query", "header"], name: str, values: list[str], schema: dict[str, Any]) -> None:
+    if len(values) > 1:
+        raise InvalidRequestError(source, name, "given more than once")
+    kinds = {kind.get("type") for kind in (schema, *schema.get("anyOf", ()))}
+    for kind, (pattern, allowed) in _NUMBERS.items():
+        if kind in kinds and any(not pattern.fullmatch(value) for value in values):
+            raise InvalidRequestError(source, name, str(SpecError(name, values[0], allowed)))

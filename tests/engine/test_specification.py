@@ -26,8 +26,10 @@ from engine.conventions import (
 from engine.digest import engine_digest
 from engine.errors import SpecError
 from engine.grid import Grid, expand, preset_names
+from engine.json_text import read_json
 from engine.scene import build_scene
 from engine.spec import Analysis, Host, Realization, realization_from_dict
+from engine.validation import field_path, path_steps
 
 HE0435 = Realization(system="HE0435", l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=21.0))
 
@@ -201,3 +203,31 @@ def test_magnitudes_and_rates_go_there_and_back() -> None:
 def test_the_engine_digest_is_a_sha256_and_stays() -> None:
     assert len(engine_digest()) == 64
     assert engine_digest() == engine_digest()
+
+
+@given(st.lists(st.one_of(st.integers(0, 10**6), st.text()), min_size=1, max_size=5))
+def test_a_path_that_people_read_leads_back_to_its_steps(steps: list[int | str]) -> None:
+    assert path_steps(field_path(steps)) == tuple(steps)
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ('{"a": {"b": 1, "b": 2}}', "a.b"),
+        ('[{"x y": 1, "x y": 1}]', '[0]["x y"]'),
+        ('{"a": "\\ud800"}', "a"),
+        ('{"\\udfff": 1}', '["\\udfff"]'),
+        ("[" * 33 + "]" * 33, "[0]" * 32),
+        ("[" * 100_000, ""),
+        ("{", ""),
+    ],
+    ids=lambda part: part[:20],
+)
+def test_json_that_is_ambiguous_or_endless_is_refused_by_its_place(text: str, field: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        read_json(text)
+    assert caught.value.field == field
+
+
+def test_json_numbers_beyond_all_bounds_are_left_to_the_fields() -> None:
+    assert read_json("[1e400, " + "9" * 5000 + ', NaN, "\\ud83d\\ude00"]')[:2] == [float("inf")] * 2
