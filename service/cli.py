@@ -324,6 +324,7 @@ def _migrating() -> Iterator[None]:
     """Where a refusal of the database or of a migration ends the command with a line instead of a traceback."""
     from sqlalchemy.exc import DBAPIError  # noqa: PLC0415 - as alembic
 
+    from service.store.faults import AWAY, one_line  # noqa: PLC0415 - as above
     from service.store.migrate import MigrationError  # noqa: PLC0415 - as above
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
@@ -332,7 +333,7 @@ def _migrating() -> Iterator[None]:
     except MigrationError as error:
         _fail(str(error))
     except DBAPIError as error:
-        _fail(f"the database refuses: {error.orig}")
+        _fail(f"the database refuses: {error if isinstance(error, AWAY) else one_line(error.orig or error)}")
 
 
 def _watch(client: Client, grid_id: str) -> None:

@@ -18,7 +18,6 @@ from service.requests import GridRequest, plan
 from service.schemas import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
 from service.store.grids import NotFoundError
 from service.store.states import RunState
-from service.store.summary import summarise
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
 _LOG = logging.getLogger(__name__)
@@ -100,7 +99,7 @@ def summary(
     cursor: Ordinal = 0,
 ) -> Response:
     """Recovered values and biases by input, and over the whole grid."""
-    found = summarise(service.database, service.grids.grid(grid_id), limit, cursor)
+    found = service.grids.summary(grid_id, limit, cursor)
     found["next"] = next_link(request, response, found["next"])
     # Written at once: by way of the model every number of the page would be checked before.
     return Response(to_json(found), media_type="application/json", headers=dict(response.headers))

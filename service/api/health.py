@@ -20,7 +20,11 @@ def healthz() -> Health:
 
 @router.get("/readyz")
 def readyz(service: Service) -> Readiness:
-    """Database, dispatcher and workers; 503 where the database is away, ``degraded`` where nothing computes."""
+    """Database, dispatcher and workers; ``degraded`` where nothing computes.
+
+    503 where the database is away or its schema is not the one that this code was written for.
+    """
+    service.database.require_schema()
     leader = service.leadership.alive()
     workers = 0 if leader is None else leader.workers
     return Readiness(

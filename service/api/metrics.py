@@ -47,6 +47,9 @@ class ApiMetrics:
             registry=self.registry,
         )
         self.under_way = Gauge("hostlens_http_requests_in_progress", "Requests under way", registry=self.registry)
+        if database.is_sqlite:
+            log = Gauge("hostlens_database_log_bytes", "Size of SQLite's write-ahead log", registry=self.registry)
+            log.set_function(database.log_bytes)
         ProcessCollector(registry=self.registry)
         self.registry.register(_DepthCollector(QueueDepth(database)))
 

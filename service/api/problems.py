@@ -20,6 +20,7 @@ from service.api.methods import allowed_methods, options
 from service.requests import TooManyRunsError
 from service.schemas import Place, Problem
 from service.store.database import AWAY
+from service.store.faults import AccessRefusedError, SchemaMismatchError, StatementTooLongError
 from service.store.grids import KeyReusedError, NotFoundError
 
 MEDIA_TYPE = "application/problem+json"
@@ -168,10 +169,22 @@ def _http(request: Request, error: Exception) -> Response:
 
 def _database(request: Request, error: Exception) -> Response:
     # Programming errors and broken constraints are ours; everything else means that the database cannot serve now.
-    if isinstance(error, DBAPIError) and not isinstance(error, AWAY):
+    if not isinstance(error, (*AWAY, PoolTimeoutError)):
         return _unexpected(request, error)
-    _LOG.error("the database is not available: %s", error)
-    return problem(request, 503, "the database is not available", headers={"Retry-After": "5"})
+    status, detail = _database_told(error)
+    _LOG.error("%s: %s", detail, error)
+    return problem(request, status, detail, headers={"Retry-After": "5"})
+
+
+def _database_told(error: Exception) -> tuple[int, str]:
+    """Status and words for a database that cannot serve: which user or file it was is for the log alone."""
+    if isinstance(error, StatementTooLongError):
+        return 504, "the database did not come to an answer within the time that it allows for a statement"
+    if isinstance(error, SchemaMismatchError):
+        return 503, str(error)
+    if isinstance(error, AccessRefusedError):
+        return 503, "the database does not let this service in: user, password, name of the database or permissions"
+    return 503, "the database is not available"
 
 
 def _unexpected(request: Request, error: Exception) -> Response:

@@ -51,10 +51,11 @@ class Heartbeat:
                     _LOG.error("another dispatcher leads")
                     self.lost.set()
                     return
+                database.cut_log()
             except DBAPIError as error:
                 # However long it takes: nobody can take over without the database either, and once it is back this
                 # beat tells whether someone has. To give up would drop the results that wait to be stored.
-                _LOG.warning("no heartbeat: %s", error.orig)
+                _LOG.warning("no heartbeat: %s", error)
             except Exception:  # noqa: BLE001 - a thread that ended here would leave a leader whom nobody sees
                 _LOG.exception("no heartbeat")
             self._wait(told)

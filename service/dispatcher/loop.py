@@ -143,7 +143,7 @@ class Dispatcher:
             self._back_off = 0.0
         except AWAY as error:
             self._back_off = min(max(2 * self._back_off, 0.2), _MAX_BACK_OFF_S)
-            _LOG.warning("the database is away, next try in %.1f s: %s", self._back_off, error.orig)
+            _LOG.warning("the database is away, next try in %.1f s: %s", self._back_off, error)
             wait(self._back_off)
 
     def _step(self) -> None:

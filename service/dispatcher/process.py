@@ -55,28 +55,32 @@ def dispatch(settings: Settings) -> int:
 
 def _dispatch(settings: Settings, metrics: DispatcherMetrics, stop: Event) -> int:
     database = Database(settings.database, asked_first=False)
-    leadership = Leadership(database, settings.leader_ttl_s)
     try:
-        generation = wait_to_lead(leadership, settings, stop)
+        generation = wait_to_lead(database, settings, stop)
         if generation is None:
             return STOPPED
         with logs.bound(generation=generation):
             _lead(settings, database, generation, metrics, stop)
         with suppress(DBAPIError):  # without it the row runs out by itself
-            leadership.resign(generation)
+            Leadership(database).resign(generation)
     finally:
         database.close()
     return STOPPED if stop.is_set() else ENDED
 
 
-def wait_to_lead(leadership: Leadership, settings: Settings, stop: Event) -> int | None:
-    """Stand by until this process leads; the generation, or None where it is stopped before."""
+def wait_to_lead(database: Database, settings: Settings, stop: Event) -> int | None:
+    """Stand by until this process leads; the generation, or None where it is stopped before.
+
+    Nobody leads on a schema that this code was not written for.
+    """
+    leadership = Leadership(database, settings.leader_ttl_s)
     name = own_name()
     while not stop.is_set():
         try:
+            database.require_schema()
             generation = leadership.take(name, is_dead)
         except DBAPIError as error:
-            _LOG.warning("cannot ask for the leadership: %s", error.orig)
+            _LOG.warning("cannot ask for the leadership: %s", error)
             generation = None
         if generation is not None:
             _LOG.info("leading as generation %d", generation)

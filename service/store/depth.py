@@ -10,7 +10,7 @@ from sqlalchemy import case, func, select, text
 
 from service.identifiers import utc_now
 from service.store.database import Database
-from service.store.leadership import Leadership, LeaderView
+from service.store.leadership import LeaderView, leader_view
 from service.store.states import GridState, RunState
 from service.store.tables import grid, run
 
@@ -38,7 +38,6 @@ class QueueDepth:
     def __init__(self, database: Database, clock: Callable[[], datetime] = utc_now) -> None:
         self._database = database
         self._clock = clock
-        self._leadership = Leadership(database, clock=clock)
 
     def look(self) -> Depth:
         """Read nothing but the two partial indices of runs and the tables of grids and of the leader."""
@@ -53,11 +52,12 @@ class QueueDepth:
             busy = connection.scalar(leased) or 0
             counted = connection.execute(select(grid.c.state, func.count()).group_by(grid.c.state))
             grids = {str(state): number for state, number in counted}
+            leading = leader_view(connection)
         return Depth(
             queued=runs - (delayed or 0),
             delayed=delayed or 0,
             leased=busy,
             waiting_s=0.0 if first is None else max((now - first).total_seconds(), 0.0),
             grids={state: grids.get(state, 0) for state in GridState if state is not GridState.RUNNING},
-            leader=self._leadership.view(),
+            leader=leading,
         )

@@ -20,6 +20,7 @@ from service.store.database import Database
 from service.store.leases import add_event, close_grids, lock_grids, pause_queued
 from service.store.pace import recent
 from service.store.states import CANCEL, RESUME, REVIVE, GridState, RunState, move
+from service.store.summary import summarise
 from service.store.tables import attempt, event, grid, idempotency, result, run
 from service.store.views import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
 
@@ -133,6 +134,11 @@ class GridStore:
         """One grid; a NotFoundError where there is none."""
         with self._database.read() as connection:
             return self._grid(connection, grid_id)
+
+    def summary(self, grid_id: str, limit: int, offset: int = 0) -> dict[str, Any]:
+        """What a grid recovered, by :func:`service.store.summary.summarise`; one picture with its state."""
+        with self._database.read() as connection:
+            return summarise(connection, self._grid(connection, grid_id), limit, offset)
 
     def grids(self, limit: int, before: str | None = None) -> GridPage:
         """A page of grids, newest first, all from one picture of the database; ``next`` holds the cursor."""

@@ -46,6 +46,14 @@ def require_generation(connection: Connection, generation: int) -> None:
         raise LeadershipLostError(f"generation {generation} was deposed by generation {current}")
 
 
+def leader_view(connection: Connection) -> LeaderView | None:
+    """The leader row, None before the first dispatcher."""
+    row = connection.execute(select(leader).where(leader.c.id == 1)).one_or_none()
+    if row is None:
+        return None
+    return LeaderView(row.generation, row.holder, row.workers, row.engines, row.beat_at, row.expires_at)
+
+
 class Leadership:
     """The leader row.
 
@@ -100,10 +108,7 @@ class Leadership:
     def view(self) -> LeaderView | None:
         """The leader row, None before the first dispatcher."""
         with self._database.read() as connection:
-            row = connection.execute(select(leader).where(leader.c.id == 1)).one_or_none()
-        if row is None:
-            return None
-        return LeaderView(row.generation, row.holder, row.workers, row.engines, row.beat_at, row.expires_at)
+            return leader_view(connection)
 
     def alive(self) -> LeaderView | None:
         """The leader if its lease has not run out."""

@@ -42,8 +42,7 @@ def current(url: str) -> str | None:
     """The revision that a database is at, None for one without tables; also one that this code does not know."""
     database = Database(url, pooled=False)
     try:
-        with database.read() as connection:
-            return MigrationContext.configure(connection).get_current_revision()
+        return database.revision()
     finally:
         database.close()
 
@@ -58,7 +57,7 @@ def upgrade(url: str, revision: str = "head", folder: Path | None = None) -> Non
     MigrationError
         A migration does not know the revision, or would leave rows that refer to nothing.
     """
-    _run(url, lambda config: command.upgrade(config, revision), folder)
+    _run(url, lambda config: command.upgrade(config, revision), folder, create=True)
 
 
 def downgrade(url: str, revision: str, folder: Path | None = None) -> None:
@@ -81,11 +80,11 @@ def _config(folder: Path | None) -> Config:
     return config
 
 
-def _run(url: str, action: Callable[[Config], object], folder: Path | None = None) -> None:
+def _run(url: str, action: Callable[[Config], object], folder: Path | None = None, *, create: bool = False) -> None:
     config = _config(folder)
     # Without foreign keys, or SQLite would see a table that a migration copies as the loss of all that refers to it;
     # the check before the commit makes up for them.
-    database = Database(url, pooled=False, foreign_keys=False)
+    database = Database(url, pooled=False, foreign_keys=False, create=create)
     try:
         # The service's own connection, so that migrations run under the same settings as everything else.
         with database.write() as connection:

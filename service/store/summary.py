@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Row, RowMapping, select
+from sqlalchemy import Connection, Row, RowMapping, select
 
 from service.payload import ESTIMATES
 from service.schemas import GridView
-from service.store.database import Database
 from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_sum, input_sum
 
 _PARTS = ("shift", "shift2", "sd", "bias", "bias_runs")
@@ -28,8 +27,8 @@ _SELECTED = (
 _TRUE = [GROUP_COLUMNS.index(quantity) for quantity in SUMMED]
 
 
-def summarise(database: Database, grid: GridView, limit: int, offset: int = 0) -> dict[str, Any]:
-    """Rows by input (all but the seed) and the whole grid, both from one picture of the database.
+def summarise(connection: Connection, grid: GridView, limit: int, offset: int = 0) -> dict[str, Any]:
+    """Rows by input (all but the seed) and the whole grid, in the transaction that read the grid.
 
     The answer is a :class:`service.schemas.Summary` as plain data, keys in the order of the models' fields. A page can
     hold two hundred thousand numbers: models of them take longer to make than all the rest, only to check what this
@@ -37,9 +36,8 @@ def summarise(database: Database, grid: GridView, limit: int, offset: int = 0) -
     """
     order = [input_sum.c[name] for name in GROUP_COLUMNS]
     rows = select(*_SELECTED).where(input_sum.c.grid_id == grid.id).order_by(*order).limit(limit + 1).offset(offset)
-    with database.read() as connection:
-        found = connection.execute(rows).all()
-        whole = connection.execute(select(grid_sum).where(grid_sum.c.grid_id == grid.id)).one_or_none()
+    found = connection.execute(rows).all()
+    whole = connection.execute(select(grid_sum).where(grid_sum.c.grid_id == grid.id)).one_or_none()
     return {
         "grid_id": grid.id,
         "state": grid.state,

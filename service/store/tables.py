@@ -30,6 +30,9 @@ from sqlalchemy.types import TypeEngine
 
 from service.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
 
+REVISION = "0005"
+"""Revision of the migrations that these tables are."""
+
 metadata = MetaData(
     naming_convention={
         "ix": "ix_%(table_name)s_%(column_0_N_name)s",

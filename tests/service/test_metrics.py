@@ -124,9 +124,9 @@ def test_the_depth_is_read_from_the_partial_indices_alone(database: Database) ->
     def note(_connection: object, _cursor: object, statement: str, *_: object) -> None:
         statements.append(statement)
 
-    event.listen(database.engine, "before_cursor_execute", note)
+    event.listen(database.reader, "before_cursor_execute", note)
     QueueDepth(database, Clock()).look()
-    event.remove(database.engine, "before_cursor_execute", note)
+    event.remove(database.reader, "before_cursor_execute", note)
     about_runs = [statement for statement in statements if "FROM run" in statement]
     assert len(about_runs) == 2
     plans = []

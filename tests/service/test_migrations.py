@@ -27,7 +27,6 @@ from service.store.migrate import (
     upgrade,
 )
 from service.store.queue import RunQueue, Stored
-from service.store.summary import summarise
 from service.store.tables import GROUP_COLUMNS, grid_sum, input_sum, metadata, result
 from tests.service import history
 from tests.service.conftest import new_database
@@ -50,7 +49,9 @@ class Empties:
     def __call__(self) -> str:
         self._made += 1
         if self._server is None:
-            return f"sqlite:///{self._folder / f'{self._made}.sqlite'}"
+            file = self._folder / f"{self._made}.sqlite"
+            file.touch()
+            return f"sqlite:///{file}"
         return new_database(self._server, f"migrations_{self._folder.name}_{self._made}")
 
 
@@ -131,7 +132,7 @@ def _assert_readable(database: Database, lived: history.Rows) -> None:
             detail = grids.run(run.id)
             stored += detail.result is not None
             assert (detail.result is not None) == (detail.state == "done")
-        assert Summary.model_validate(summarise(database, grid, 100)).n_runs == grid.n_runs
+        assert Summary.model_validate(GridStore(database).summary(grid.id, 100)).n_runs == grid.n_runs
     assert stored == len(lived["result"]) == 3
 
 

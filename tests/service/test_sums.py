@@ -17,7 +17,6 @@ from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import downgrade, upgrade
 from service.store.queue import RunQueue
-from service.store.summary import summarise
 from service.store.tables import GROUP_COLUMNS, SUMMED, input_sum, result
 from service.tables import summary_table
 from tests.service.plans import result_of
@@ -71,7 +70,7 @@ OLD = ("paper_free", "paper_fixed", "projected_free", "projected_fixed")
 
 
 def check(database: Database, grid_id: str, estimates: Sequence[str] = ESTIMATES) -> None:
-    summary = Summary.model_validate(summarise(database, GridStore(database).grid(grid_id), 1000))
+    summary = Summary.model_validate(GridStore(database).summary(grid_id, 1000))
     assert summary.n_stored == summary.n_runs == 3 * len(summary.rows)
     for estimate in estimates:
         for quantity in SUMMED:
@@ -104,7 +103,7 @@ def test_a_migration_adds_up_what_was_stored_before(database: Database, url: str
     downgrade(url, "0002")
     upgrade(url)
     check(database, grid_id, OLD)
-    summary = Summary.model_validate(summarise(database, GridStore(database).grid(grid_id), 1000))
+    summary = Summary.model_validate(GridStore(database).summary(grid_id, 1000))
     for row in summary.rows:
         assert {name for name, found in row.estimates.items() if found is not None} == set(OLD)
     assert {name for name, found in summary.overall.items() if found is not None} == set(OLD)
@@ -130,7 +129,7 @@ def test_a_run_without_an_answer_is_not_in_the_means(database: Database) -> None
             assert found is not None
             expected.append(found.magnitude.mean)
         queue.store(lease, payload.model_copy(update={"estimates": changed}))
-    summary = Summary.model_validate(summarise(database, GridStore(database).grid(grid_id), 1000))
+    summary = Summary.model_validate(GridStore(database).summary(grid_id, 1000))
     (row,) = summary.rows
     answered = row.estimates["paper_free"]
     assert row.estimates["image_wide"] is None
