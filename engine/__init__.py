@@ -3,6 +3,10 @@
 This module is the engine's public face: everything that ``service`` or a user may import.
 """
 
+import engine.home  # noqa: F401 - before Astropy is imported
+
+# isort: split
+
 from engine.acceptance import check_realization
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
 from engine.catalogue.user_files import read_camera, read_mapping, read_system

@@ -1,6 +1,28 @@
-"""``python -m service``: the command line."""
+"""The command line: ``hostlens``, ``python -m service``."""
 
-from service.cli import app
+import signal
+import sys
+
+from service import start
+
+_SERVICES = frozenset({"serve", "api", "dispatcher", "scheduler", "worker"})
+
+
+def main() -> None:
+    """Run a command."""
+    service = sys.argv[1:2] and sys.argv[1] in _SERVICES
+    start.begin(service=bool(service))
+    from service.cli import app  # noqa: PLC0415 - takes a while
+
+    if not service:
+        start.interruptible()
+    try:
+        app()
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
+    finally:
+        start.finish(service=bool(service))
+
 
 if __name__ == "__main__":
-    app()
+    main()

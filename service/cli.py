@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,19 +10,59 @@ from typing import Annotated, Any, NoReturn
 
 import httpx
 import typer
-from pydantic import ValidationError
 from rich.console import Console
+from typer.core import TyperGroup
+from typer.exceptions import TyperException
 
 from service import VERSION
-from service.client import ApiError, Client
+from service.client import Client, ClientError, RequestError
 from service.measuring import measure
+from service.outputs import require_file
 from service.pictures import COMMANDS, named_or_read
-from service.settings import Settings
+from service.request_file import read_request
+from service.settings import ConfigurationError, Settings, read_settings
+from service.start import CONFIGURATION
 from service.tables import grid_line, runs_table, summary_table
 from service.watch import progress
 
+_ARGUMENTS_WANTED = "NoArgsIsHelpError"
+
+
+class _FailedError(RuntimeError):
+    """What was asked for could not be done."""
+
+
+class _CommandLine(TyperGroup):
+    """Where every refusal becomes one line on standard error, and a mistake of ours stays a traceback.
+
+    The exit code is 2 where something else has to be asked for, 1 where the same may succeed another time.
+    """
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run a command; SystemExit in any case."""
+        try:
+            code = super().main(*args, **{**extra, "standalone_mode": False})
+        except TyperException as error:
+            if type(error).__name__ == _ARGUMENTS_WANTED:
+                typer.echo(error.format_message())
+                raise SystemExit(CONFIGURATION) from None
+            self._refuse(error.format_message(), error.exit_code)
+        except (ConfigurationError, RequestError) as error:
+            self._refuse(str(error), CONFIGURATION)
+        except httpx.RequestError as error:
+            self._refuse(f"the service does not answer: {error}", 1)
+        except (ClientError, _FailedError, OSError, typer.Abort) as error:
+            self._refuse(str(error) or "given up", 1)
+        raise SystemExit(code if isinstance(code, int) else 0)
+
+    def _refuse(self, message: str, code: int) -> NoReturn:
+        typer.echo(f"hostlens: {' '.join(message.split())}", err=True)
+        raise SystemExit(code) from None
+
+
 app = typer.Typer(
     name="hostlens",
+    cls=_CommandLine,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
@@ -41,23 +80,12 @@ def _console() -> Console:
     return Console()
 
 
-def _fail(message: str) -> NoReturn:
-    Console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
-    raise typer.Exit(1)
-
-
 def _settings(**changes: Any) -> Settings:
-    try:
-        return Settings(**{name: value for name, value in changes.items() if value is not None})
-    except ValidationError as error:
-        _fail("\n".join(f"setting {'.'.join(map(str, e['loc'])) or 'HOSTLENS_*'}: {e['msg']}" for e in error.errors()))
+    return read_settings(Settings, **changes)
 
 
 def _client(url: str | None) -> Client:
-    if url is None:
-        settings = _settings()
-        url = f"http://{settings.host}:{settings.port}"
-    return Client(url)
+    return Client(_settings().url if url is None else url)
 
 
 def _version(wanted: bool) -> None:
@@ -86,12 +114,9 @@ def serve(
 
     settings = _settings(host=host, port=port, workers=workers, data_dir=data_dir)
     logs.configure(settings, "supervisor")
-    address = f"http://{settings.host}:{settings.port}"
-    try:
-        with _migrating():
-            supervise(settings, lambda: _console().print(f"hostlens serves {address}; Ctrl-C ends it", highlight=False))
-    except OSError as error:
-        _fail(f"cannot serve {address}: {error}")
+    with _migrating():
+        code = supervise(settings, lambda: typer.echo(f"hostlens serves {settings.url}; Ctrl-C ends it"))
+    raise typer.Exit(code)
 
 
 @app.command()
@@ -113,14 +138,13 @@ def dispatcher() -> None:
 @app.command()
 def scheduler(
     host: Annotated[str, typer.Option(help="Where it listens; whoever reaches it can run code on the workers")],
-    port: Annotated[int, typer.Option(help="Port for dispatcher and workers")] = 8786,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port for dispatcher and workers")] = 8786,
     health: Annotated[str, typer.Option(help="Address of /health and /metrics")] = "127.0.0.1:8787",
 ) -> None:
     """Run a Dask scheduler for workers on several machines."""
     from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
 
     settings = _settings()
-    settings.make_folders()
     standalone.become(settings, standalone.scheduler_arguments(settings, host, port, health))
 
 
@@ -133,8 +157,7 @@ def worker(
     """Run workers for a scheduler, here or on another machine."""
     from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
 
-    settings = _settings()
-    settings.make_folders()
+    settings = _settings(scheduler_address=address, cluster="address")
     standalone.become(settings, standalone.worker_arguments(settings, address, workers, health))
 
 
@@ -162,20 +185,20 @@ def submit(
     seed: Annotated[int | None, typer.Option()] = None,
     replicates: Annotated[int | None, typer.Option()] = None,
     name: Annotated[str | None, typer.Option(help="For people")] = None,
-    file: Annotated[Path | None, typer.Option(help="A JSON body; options override it", exists=True)] = None,
+    file: Annotated[Path | None, typer.Option(help="A JSON body; options override it")] = None,
     key: Annotated[str | None, typer.Option(help="Idempotency key")] = None,
     watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
     url: Url = None,
 ) -> None:
     """Submit a grid."""
-    request = {} if file is None else json.loads(file.read_text(encoding="utf-8"))
+    request = {} if file is None else read_request(file)
     options = {
         "preset": preset, "systems": [named_or_read(entry) for entry in system or []],
         "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed,
         "replicates": replicates, "name": name,
     }  # fmt: skip
     request |= {option: value for option, value in options.items() if value not in (None, [])}
-    with _Talk(url) as client:
+    with _client(url) as client:
         grid = client.submit(request, key)
         typer.echo(grid.id)
         if watch:
@@ -190,7 +213,7 @@ def status(
     url: Url = None,
 ) -> None:
     """How far grids are."""
-    with _Talk(url) as client:
+    with _client(url) as client:
         if grid is None:
             for item in client.grids().items:
                 typer.echo(grid_line(item))
@@ -209,7 +232,7 @@ def results(
     url: Url = None,
 ) -> None:
     """Recovered values and biases of a grid."""
-    with _Talk(url) as client:
+    with _client(url) as client:
         summary = client.summary(grid)
         if as_json:
             typer.echo(summary.model_dump_json(indent=2))
@@ -220,28 +243,28 @@ def results(
 @app.command()
 def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Cancel a grid."""
-    with _Talk(url) as client:
+    with _client(url) as client:
         typer.echo(grid_line(client.cancel(grid)))
 
 
 @app.command()
 def pause(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Start no further run of a grid for now; running ones go on to their end."""
-    with _Talk(url) as client:
+    with _client(url) as client:
         typer.echo(grid_line(client.pause(grid)))
 
 
 @app.command()
 def resume(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Go on with a paused grid."""
-    with _Talk(url) as client:
+    with _client(url) as client:
         typer.echo(grid_line(client.resume(grid)))
 
 
 @app.command()
 def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Queue again what failed, was quarantined or was cancelled."""
-    with _Talk(url) as client:
+    with _client(url) as client:
         typer.echo(grid_line(client.retry(grid)))
 
 
@@ -259,14 +282,25 @@ def drill(
     json_file: Annotated[Path | None, typer.Option("--json", help="Where to write the report")] = None,
 ) -> None:
     """Put a promise of the service to the test, on a service of its own; exit code 1 if it does not hold."""
+    from service import preflight  # noqa: PLC0415 - loads SQLAlchemy
     from service.drills.command import carry_out  # noqa: PLC0415 - loads the engine
+    from service.drills.installation import DrillError  # noqa: PLC0415 - as above
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
     sizes = size or []
     if any("=" not in changed for changed in sizes):
-        _fail(f"sizes are given as name=value: {' '.join(sizes)}")
+        raise typer.BadParameter(f"sizes are given as name=value: {' '.join(sizes)}")
+    if json_file is not None:
+        require_file(json_file)
+    if database_url is not None and database_url != "postgresql":
+        preflight.require_database(_settings(database_url=database_url))
     options = {"sizes": sizes, "small": small, "database_url": database_url, "json_file": json_file}
-    raise typer.Exit(carry_out(_console(), name, **options))  # type: ignore[arg-type]
+    try:
+        with _migrating():
+            code = carry_out(_console(), name, **options)  # type: ignore[arg-type]
+    except DrillError as error:
+        raise typer.BadParameter(str(error)) from error
+    raise typer.Exit(code)
 
 
 @database.command("upgrade")
@@ -274,8 +308,7 @@ def db_upgrade(revision: Annotated[str, typer.Argument(help="Which; the newest w
     """Bring the database to a newer schema, by default the newest; may be repeated, by several at once."""
     from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
-    settings = _settings()
-    settings.make_folders()
+    settings = _database_settings()
     with _migrating():
         migrate.upgrade(settings.database, revision)
     typer.echo(f"the database is at revision {migrate.current(settings.database)}")
@@ -289,7 +322,7 @@ def db_downgrade(
     """Take the database back to an older schema; what only the newer one has is lost. Stop the service first."""
     from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
-    settings = _settings()
+    settings = _database_settings()
     if not yes:
         typer.confirm(f"take the database back to revision {revision}?", abort=True)
     with _migrating():
@@ -303,7 +336,7 @@ def db_current() -> None:
     from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
     with _migrating():
-        found = migrate.current(_settings().database)
+        found = migrate.current(_database_settings().database)
     typer.echo(f"database {found or 'base'}, code {migrate.revisions()[-1]}")
 
 
@@ -313,10 +346,21 @@ def db_check() -> None:
     from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
     with _migrating():
-        found = migrate.differences(_settings().database)
+        found = migrate.differences(_database_settings().database)
     if found is not None:
-        _fail(found)
+        raise _FailedError(found)
     typer.echo("the database is what the code expects")
+
+
+def _database_settings() -> Settings:
+    """The settings, with a database that can be used as far as this machine is concerned."""
+    from service import preflight  # noqa: PLC0415 - loads SQLAlchemy
+
+    settings = _settings()
+    if settings.database_url is None:
+        preflight.require_data(settings)
+    preflight.require_database(settings)
+    return settings
 
 
 @contextmanager
@@ -331,9 +375,10 @@ def _migrating() -> Iterator[None]:
     try:
         yield
     except MigrationError as error:
-        _fail(str(error))
+        raise _FailedError(str(error)) from error
     except DBAPIError as error:
-        _fail(f"the database refuses: {error if isinstance(error, AWAY) else one_line(error.orig or error)}")
+        told = error if isinstance(error, AWAY) else one_line(error.orig or error)
+        raise _FailedError(f"the database refuses: {told}") from error
 
 
 def _watch(client: Client, grid_id: str) -> None:
@@ -342,20 +387,3 @@ def _watch(client: Client, grid_id: str) -> None:
     typer.echo(grid_line(grid))
     if grid.counts.done != grid.n_runs:
         raise typer.Exit(1)
-
-
-class _Talk:
-    """A client whose refusals end the command with a line instead of a traceback."""
-
-    def __init__(self, url: str | None) -> None:
-        self._client = _client(url)
-
-    def __enter__(self) -> Client:
-        return self._client.__enter__()
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        self._client.__exit__()
-        if isinstance(error, ApiError):
-            _fail(str(error))
-        if isinstance(error, httpx.TransportError):
-            _fail(f"the service does not answer: {error}")

@@ -2,36 +2,58 @@
 
 from __future__ import annotations
 
+import json
+import re
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Self
+from typing import Any, Self, TypeVar
+from urllib.parse import quote
 
 import httpx
+from pydantic import BaseModel, ValidationError
 
 from service.schemas import EventPage, GridPage, GridView, Readiness, RunDetail, RunPage, RunView, Summary
 
 _TIMEOUT_S = 60.0
 
 
-class ApiError(RuntimeError):
+T = TypeVar("T", bound=BaseModel)
+
+
+class ClientError(RuntimeError):
+    """The service did not do what it was asked for."""
+
+
+class ApiError(ClientError):
     """The API refused a request; ``problem`` is its answer."""
 
     def __init__(self, status: int, problem: dict[str, Any]) -> None:
-        lines = [problem.get("detail") or problem.get("title") or f"status {status}"]
-        lines += [f"  {place.get('pointer')}: {place.get('message')}" for place in problem.get("errors", ())]
-        super().__init__("\n".join(lines))
+        # The places say what the detail says as a whole.
+        places = [f"{place.get('pointer') or place.get('in')}: {place.get('message')}" for place in _places(problem)]
+        super().__init__("; ".join(places) or str(problem.get("detail") or problem.get("title") or f"status {status}"))
         self.status = status
         self.problem = problem
+
+
+class AnswerError(ClientError):
+    """Whatever answers there is no hostlens, or one that this client does not know."""
+
+
+class RequestError(ClientError, ValueError):
+    """The request cannot be sent: the address, the key or a value is not one."""
 
 
 class Client:
     """Speaks to one service; a context manager that closes its connections.
 
     Every method makes one request (``runs`` one for each page, ``wait`` one for each look) and raises
-    :class:`ApiError` where the service refuses, ``httpx.TransportError`` where there is none.
+    :class:`ApiError` where the service refuses, :class:`AnswerError` where it is something else, ``httpx.RequestError``
+    where there is none, and :class:`RequestError` where there was nothing that could be sent.
     """
 
     def __init__(self, url: str, transport: httpx.BaseTransport | None = None) -> None:
+        _require_address(url)
+        self._url = _without_password(url)
         self._http = httpx.Client(base_url=url, timeout=_TIMEOUT_S, transport=transport, trust_env=False)
 
     def __enter__(self) -> Self:
@@ -44,16 +66,20 @@ class Client:
 
     def submit(self, request: dict[str, Any], key: str | None = None) -> GridView:
         """Submit a grid; with ``key`` a repetition gives back the grid of the first time."""
-        headers = {} if key is None else {"Idempotency-Key": key}
-        return GridView.model_validate(self._call("POST", "/v1/grids", json=request, headers=headers))
+        headers = {"Content-Type": "application/json"}
+        if key is not None:
+            if not (key.isascii() and key.isprintable()):
+                raise RequestError(f"the idempotency key is {key!r}, allowed are printable ASCII characters")
+            headers["Idempotency-Key"] = key
+        return self._call(GridView, "POST", "/v1/grids", content=_as_json(request), headers=headers)
 
     def status(self, grid_id: str) -> GridView:
         """How far a grid is."""
-        return GridView.model_validate(self._call("GET", f"/v1/grids/{grid_id}"))
+        return self._call(GridView, "GET", f"/v1/grids/{_part(grid_id)}")
 
     def grids(self, limit: int = 20) -> GridPage:
         """The newest grids."""
-        return GridPage.model_validate(self._call("GET", "/v1/grids", params={"limit": limit}))
+        return self._call(GridPage, "GET", "/v1/grids", params={"limit": limit})
 
     def wait(
         self,
@@ -75,48 +101,101 @@ class Client:
 
     def runs(self, grid_id: str) -> Iterator[RunView]:
         """All runs of a grid, page by page."""
-        address: str | None = f"/v1/grids/{grid_id}/runs?limit=1000"
+        address: str | None = f"/v1/grids/{_part(grid_id)}/runs?limit=1000"
         while address is not None:
-            page = RunPage.model_validate(self._call("GET", address))
+            page = self._call(RunPage, "GET", address)
             yield from page.items
             address = page.next
 
     def run(self, run_id: str) -> RunDetail:
         """One run with its result."""
-        return RunDetail.model_validate(self._call("GET", f"/v1/runs/{run_id}"))
+        return self._call(RunDetail, "GET", f"/v1/runs/{_part(run_id)}")
 
     def summary(self, grid_id: str) -> Summary:
         """Biases of a grid (the first thousand inputs)."""
-        return Summary.model_validate(self._call("GET", f"/v1/grids/{grid_id}/summary", params={"limit": 1000}))
+        return self._call(Summary, "GET", f"/v1/grids/{_part(grid_id)}/summary", params={"limit": 1000})
 
     def events(self, grid_id: str, after: int = 0, wait_s: float = 0.0) -> EventPage:
         """Events after number ``after``, oldest first; waits up to ``wait_s`` (30 at most) where there is none yet."""
         params = {"cursor": after, "wait": wait_s, "limit": 1000}
-        return EventPage.model_validate(self._call("GET", f"/v1/grids/{grid_id}/events", params=params))
+        return self._call(EventPage, "GET", f"/v1/grids/{_part(grid_id)}/events", params=params)
 
     def cancel(self, grid_id: str) -> GridView:
         """Cancel a grid."""
-        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/cancel"))
+        return self._call(GridView, "POST", f"/v1/grids/{_part(grid_id)}/cancel")
 
     def pause(self, grid_id: str) -> GridView:
         """Start no further run of a grid for now."""
-        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/pause"))
+        return self._call(GridView, "POST", f"/v1/grids/{_part(grid_id)}/pause")
 
     def resume(self, grid_id: str) -> GridView:
         """Go on with a paused grid."""
-        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/resume"))
+        return self._call(GridView, "POST", f"/v1/grids/{_part(grid_id)}/resume")
 
     def retry(self, grid_id: str) -> GridView:
         """Queue again what failed, was quarantined or was cancelled."""
-        return GridView.model_validate(self._call("POST", f"/v1/grids/{grid_id}/retry"))
+        return self._call(GridView, "POST", f"/v1/grids/{_part(grid_id)}/retry")
 
     def readiness(self) -> Readiness:
         """Whether the service can compute."""
-        return Readiness.model_validate(self._call("GET", "/readyz"))
+        return self._call(Readiness, "GET", "/readyz")
 
-    def _call(self, method: str, address: str, **options: Any) -> Any:
+    def _call(self, kind: type[T], method: str, address: str, **options: Any) -> T:
         answer = self._http.request(method, address, **options)
         if answer.is_error:
-            is_json = answer.headers.get("content-type", "").startswith("application/problem+json")
-            raise ApiError(answer.status_code, answer.json() if is_json else {"title": answer.reason_phrase})
-        return answer.json()
+            raise ApiError(answer.status_code, _problem(answer))
+        try:
+            return kind.model_validate_json(answer.content)
+        except ValidationError:
+            said = f"status {answer.status_code}, {answer.headers.get('content-type', 'no content type')}"
+            raise AnswerError(f"what answers at {self._url} is not hostlens as this client knows it: {said}") from None
+
+
+def _require_address(url: str) -> None:
+    try:
+        parsed = httpx.URL(url)
+        acceptable = parsed.scheme in {"http", "https"} and bool(parsed.host) and (parsed.port or 1) < 65536
+    except (httpx.InvalidURL, ValueError, TypeError):
+        acceptable = False
+    if not acceptable:
+        raise RequestError(
+            f"the address of the service is {_without_password(url)!r}, allowed is one as http://127.0.0.1:8421"
+        )
+
+
+def _without_password(url: str) -> str:
+    return re.sub(r"//[^/]*@", "//***@", url)
+
+
+def _part(identifier: str) -> str:
+    """An identifier as a part of a path, whatever is in it."""
+    try:
+        return quote(identifier, safe="")
+    except UnicodeEncodeError:
+        raise RequestError(f"{identifier!r} is not an identifier") from None
+
+
+def _as_json(request: dict[str, Any]) -> bytes:
+    try:
+        return json.dumps(request, ensure_ascii=False, allow_nan=False).encode()
+    except UnicodeEncodeError:
+        raise RequestError("the request holds text that is not Unicode") from None
+    except (ValueError, RecursionError):
+        raise RequestError("the request holds a number that is not finite, or is nested too deeply") from None
+
+
+def _problem(answer: httpx.Response) -> dict[str, Any]:
+    """What the API says of an error; where something else answers, the words of its status."""
+    plain = {"title": f"status {answer.status_code} {answer.reason_phrase}".strip()}
+    if not answer.headers.get("content-type", "").startswith("application/problem+json"):
+        return plain
+    try:
+        said = answer.json()
+    except (ValueError, RecursionError):
+        return plain
+    return said if isinstance(said, dict) else plain
+
+
+def _places(problem: dict[str, Any]) -> list[dict[str, Any]]:
+    places = problem.get("errors")
+    return [place for place in places if isinstance(place, dict)] if isinstance(places, list) else []

@@ -10,14 +10,16 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
+from types import FrameType
 
 import httpx
 from rich.console import Console
 
 from service.artefacts import ArtefactStore
-from service.client import ApiError, Client
+from service.client import Client, ClientError
 from service.schemas import GridView
 from service.settings import Settings
+from service.start import STOPS
 from service.supervisor import Supervisor
 from service.tables import duration, summary_table
 from service.watch import Show, progress
@@ -49,8 +51,9 @@ def demo(settings: Settings, console: Console, timeout_s: float = 3600.0) -> int
         "port": _free_port(),
     }
     settings = settings.model_copy(update=own)
-    console.print(f"API, dispatcher and {settings.workers} workers; data in {folder}", highlight=False, soft_wrap=True)
     with _running(settings) as stop, Client(f"http://127.0.0.1:{settings.port}") as client:
+        said = f"API, dispatcher and {settings.workers} workers; data in {folder}"
+        console.print(said, highlight=False, soft_wrap=True)
         try:
             _wait_ready(client, stop)
             console.print(f"ready after {duration(time.monotonic() - began)}: http://127.0.0.1:{settings.port}")
@@ -59,9 +62,9 @@ def demo(settings: Settings, console: Console, timeout_s: float = 3600.0) -> int
             with progress(console) as show:
                 grid = client.wait(grid.id, _until(stop, show), timeout_s=timeout_s)
             _report(console, client, settings, grid)
-        except (ApiError, httpx.TransportError, TimeoutError, _StoppedError) as error:
+        except (ClientError, httpx.RequestError, TimeoutError, _StoppedError) as error:
             console.print(f"the demo ends early: {error}", markup=False, soft_wrap=True)
-            return 1
+            return 128 + stop.number if stop.number else 1
     console.print(f"wall time {duration(time.monotonic() - began)}; all processes have ended")
     return 0 if grid.counts.done == grid.n_runs else 1
 
@@ -82,6 +85,17 @@ class _StoppedError(RuntimeError):
     """Someone pressed Ctrl-C."""
 
 
+class _Wanted(threading.Event):
+    """Set by the signal ``number``."""
+
+    number = 0
+
+    def by_signal(self, number: int, _frame: FrameType | None) -> None:
+        """Handle it."""
+        self.number = number
+        self.set()
+
+
 def _until(stop: threading.Event, show: Show) -> Show:
     def shown(grid: GridView) -> None:
         show(grid)
@@ -92,12 +106,12 @@ def _until(stop: threading.Event, show: Show) -> Show:
 
 
 @contextmanager
-def _running(settings: Settings) -> Iterator[threading.Event]:
+def _running(settings: Settings) -> Iterator[_Wanted]:
     """The supervised service for as long as the context lasts; the event is set when the user wants to stop."""
     supervisor = Supervisor(settings, log_folder=settings.data_dir)
     supervisor.prepare()
-    wanted, end = threading.Event(), threading.Event()
-    before = {number: signal.signal(number, lambda *_: wanted.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    wanted, end = _Wanted(), threading.Event()
+    before = {number: signal.signal(number, wanted.by_signal) for number in STOPS}
     thread = threading.Thread(target=supervisor.run, args=(end,), name="supervisor")
     thread.start()
     try:
@@ -115,7 +129,7 @@ def _wait_ready(client: Client, stop: threading.Event) -> None:
         try:
             if client.readiness().status == "ready":
                 return
-        except (httpx.TransportError, ApiError):
+        except (httpx.RequestError, ClientError):
             pass  # the API is still starting
         if stop.wait(0.2):
             raise _StoppedError("interrupted")

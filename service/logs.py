@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import structlog
 from structlog.typing import EventDict, Processor
 
-from service.settings import LogSettings
+from service.log_stream import PatientHandler
+from service.settings import LogSettings, read_settings
 
 if TYPE_CHECKING:
     from service.store.leases import Lease
@@ -29,8 +30,11 @@ _FOREIGN = ("distributed", "distributed.client", "distributed.gc", "bokeh", "tor
 
 
 def configure(settings: LogSettings, process: str) -> None:
-    """Write the logs of this process, called ``process`` on every line, to standard error as the settings say."""
-    handler = logging.StreamHandler()
+    """Write the logs of this process, called ``process`` on every line, to standard error as the settings say.
+
+    It never waits for whoever reads them: see :class:`~service.log_stream.PatientHandler`.
+    """
+    handler = PatientHandler()
     handler.setFormatter(_formatter(settings, process))
     logging.root.handlers = [handler]
     logging.root.setLevel(settings.log_level)
@@ -69,7 +73,7 @@ def bind(**fields: str | int) -> None:
 
 def dask_setup(server: Any) -> None:
     """Configure the process of a Dask scheduler or worker, which preloads this module."""
-    configure(LogSettings(), type(server).__name__.lower())
+    configure(read_settings(LogSettings), type(server).__name__.lower())
 
 
 def _formatter(settings: LogSettings, process: str) -> logging.Formatter:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from service.outputs import FITS, PICTURES, require_apart, require_file
 from service.pictures import refusals
 
 if TYPE_CHECKING:
@@ -52,7 +53,10 @@ def measure(
     if no_agn and (agn_images or positions):
         raise typer.BadParameter("--no-agn: there are --agn-images or --positions as well")
     outputs = [path for path in (json_file, figure, fits) if path is not None]
-    _check_outputs(outputs)
+    require_apart(outputs, [path for path in (image, noise, psf, mask) if path is not None])
+    for path, kinds in ((json_file, ()), (figure, PICTURES), (fits, FITS)):
+        if path is not None:
+            require_file(path, kinds)
     with refusals():
         from engine import measure_image  # noqa: PLC0415 - the engine takes seconds to load
 
@@ -118,16 +122,6 @@ def _positions(given: list[str] | None) -> list[tuple[float, float]] | None:
             raise typer.BadParameter(f"--positions: got {text!r}, allowed is x,y in arcsec, as 1.2,-0.4") from None
         out.append((x, y))
     return out
-
-
-def _check_outputs(paths: list[Path]) -> None:
-    """What cannot be written is said before the work, not after it."""
-    for path in paths:
-        if path.is_dir():
-            raise typer.BadParameter(f"{path}: is a folder")
-        parent = path.absolute().parent
-        if not parent.is_dir() or not os.access(parent, os.W_OK):
-            raise typer.BadParameter(f"{path}: its folder is not there or cannot be written")
 
 
 def _write(found: ImageMeasurement, json_file: Path | None, figure: Path | None, fits: Path | None) -> None:

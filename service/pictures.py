@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from service.outputs import PICTURES, require_file, require_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -89,6 +92,7 @@ def montage(
 
         document = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
         runs = expand(_validated(Grid, preset=f"h0licow-vi/{system}", camera=_camera(camera), **document))
+        require_folder(out)
         observations = []
         with _progress(f"simulating {system}", len(runs)) as advance:
             for run in runs:
@@ -110,6 +114,7 @@ def gallery(
 
         grid = _validated(Grid, preset="h0licow-vi", seed=seed, noise_level=noise_level)
         runs = [run for run in expand(grid) if run.paper_run == paper_run]
+        require_folder(out)
         simulations: list[Simulation] = []
         with _progress("simulating the eight systems", len(runs)) as advance:
             for run in runs:
@@ -142,6 +147,9 @@ def inversion(
         from engine.figures import inversion_figure  # noqa: PLC0415
 
         realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
+        path = out or Path(f"{_as_file(realization.system_name)}_inversion.png")
+        require_folder(path.parent)
+        require_file(path, PICTURES)
         with _progress(f"inverting {realization.system_name}", 3) as advance:
             simulation = simulate_realization(realization)
             advance()
@@ -149,7 +157,7 @@ def inversion(
             advance()
             figure = inversion_figure(view)
             advance()
-        _save(figure, out or Path(f"{realization.system_name}_inversion.png"))
+        _save(figure, path)
 
 
 COMMANDS = (simulate, montage, gallery, inversion)
@@ -221,13 +229,13 @@ def _write_one(realization: Realization, out: Path) -> None:
     host = realization.host
     # The digest in the name: another seed or camera is another file, and the same command writes the same one again.
     stem = (
-        f"{realization.system_name}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
+        f"{_as_file(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
         f"_{realization.digest[:8]}"
     )
+    require_folder(out)
     with _progress(f"simulating {realization.system_name}", 3) as advance:
         simulation = simulate_realization(realization)
         advance()
-        out.mkdir(parents=True, exist_ok=True)
         write_observation(out / f"{stem}.fits", simulation.observation, overwrite=True)
         advance()
         figure = simulation_figure(simulation)
@@ -239,8 +247,12 @@ def _write_one(realization: Realization, out: Path) -> None:
         typer.echo(f"the camera has no noise level {record['NOISEREQ']!r}: {record['NOISE']!r} was used", err=True)
 
 
+def _as_file(name: str) -> str:
+    """The name of a system of anybody's, without what a file cannot be called."""
+    return re.sub(r"[^\w.+-]", "_", name)[:80]
+
+
 def _save(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DPI)
     typer.echo(path)
 
@@ -250,7 +262,9 @@ def _progress(what: str, steps: int) -> Iterator[Any]:
     columns: Sequence[Any] = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    # Elsewhere than on a terminal a bar that has gone leaves an empty line.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(what, total=steps)
         yield lambda: bar.advance(task)
 

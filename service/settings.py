@@ -2,27 +2,62 @@
 
 from __future__ import annotations
 
+import os
+import re
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-Seconds = Annotated[float, Field(gt=0.0, le=7 * 86400.0, allow_inf_nan=False)]
-ClusterKind = Literal["local", "address", "slurm", "kubernetes"]
-LogLevel = Annotated[
-    Literal["DEBUG", "INFO", "WARNING", "ERROR"],
-    BeforeValidator(lambda level: level.upper() if isinstance(level, str) else level),
-]
+from service.process import PARENT_FD
+from service.setting_types import (
+    ArtefactUrl,
+    ClusterKind,
+    DaskAddress,
+    DatabaseUrl,
+    Home,
+    Host,
+    KubernetesMemory,
+    Lines,
+    LogLevel,
+    Memory,
+    Seconds,
+    Walltime,
+    WorkerMemory,
+)
+
+_PREFIX = "HOSTLENS_"
+OTHERS = frozenset({"HOSTLENS_URL", PARENT_FD})
+"""Variables that are no settings: of the command line's client, of the supervisor for its children."""
+DEPLOYMENT = frozenset(
+    f"HOSTLENS_{name}" for name in ("DB_PASSWORD", "TAG", "SHARED", "SCHEDULER_HOST", "SCHEDULER_PORT")
+)
+"""Variables of the files in ``deploy/``, which the processes started there inherit."""
+_FAMILIES = ("HOSTLENS_DRILL_",)
+"""Variables of the drills for their own tasks."""
+_LINK = re.compile(r"_SERVICE_(HOST|PORT(_\w+)?)$|_PORT_\d+_(TCP|UDP|SCTP)(_\w+)?$")
+"""What Kubernetes puts into every pod for each Service, unless it is told not to."""
+_SECRET = frozenset({"database_url", "artefact_url"})
+"""They may hold a password: their values are never repeated."""
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 _CLOSE_S = 8.0
 """What a dispatcher needs to hand runs back and to end its workers."""
+T = TypeVar("T", bound="LogSettings")
+
+
+class ConfigurationError(ValueError):
+    """A setting, or what it names, is not acceptable: one line that names the variable and what is allowed.
+
+    To start again would not help: processes end by it with exit code 2, and nobody starts them again.
+    """
 
 
 class LogSettings(BaseSettings):
     """How a process logs: all that a worker or a scheduler of Dask needs to know."""
 
-    model_config = SettingsConfigDict(env_prefix="HOSTLENS_", extra="ignore")
+    model_config = SettingsConfigDict(env_prefix=_PREFIX, extra="ignore", str_strip_whitespace=True)
 
     log_format: Literal["text", "json"] = "text"
     log_level: LogLevel = "INFO"
@@ -37,14 +72,14 @@ class Settings(LogSettings):
         Names the variable that is not acceptable.
     """
 
-    data_dir: Path = Path("var/hostlens")
+    data_dir: Home = Path("var/hostlens")
     """Where the embedded database, the artefacts and Dask's scratch files lie unless said otherwise."""
-    database_url: str | None = None
+    database_url: DatabaseUrl | None = None
     """SQLAlchemy URL; a SQLite file in ``data_dir`` where None."""
-    artefact_url: str | None = None
+    artefact_url: ArtefactUrl | None = None
     """fsspec URL of the artefact store; a folder in ``data_dir`` where None."""
 
-    host: str = "127.0.0.1"
+    host: Host = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535)] = 8421
     allow_remote: bool = False
     """Let the API listen beyond loopback. There are no tokens yet: whoever reaches the port may submit."""
@@ -57,41 +92,41 @@ class Settings(LogSettings):
     """Single-thread workers of a cluster that is started from here."""
     cluster: ClusterKind | None = None
     """Where the workers are; where None, at ``scheduler_address`` if there is one, else on this machine."""
-    scheduler_address: str | None = None
+    scheduler_address: DaskAddress | None = None
     """A Dask scheduler started elsewhere, with workers of its own."""
-    tls_ca: Path | None = None
+    tls_ca: Home | None = None
     """With ``tls_cert`` and ``tls_key``, PEM files: only TLS is spoken to the scheduler and its workers."""
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
+    tls_cert: Home | None = None
+    tls_key: Home | None = None
     slurm_queue: str | None = None
     slurm_account: str | None = None
-    slurm_walltime: str = "24:00:00"
+    slurm_walltime: Walltime = "24:00:00"
     slurm_interface: str | None = None
     """Network interface that nodes and dispatcher reach each other by."""
-    slurm_memory: str = "4GB"
+    slurm_memory: Memory = "4GB"
     """Memory of a job."""
     slurm_workers_per_job: Annotated[int, Field(ge=1, le=1024)] = 1
-    slurm_directives: list[str] = Field(default_factory=list)
+    slurm_directives: Lines = Field(default_factory=list)
     """More ``#SBATCH`` lines, as a JSON list."""
-    slurm_prologue: list[str] = Field(default_factory=list)
+    slurm_prologue: Lines = Field(default_factory=list)
     """Commands before a worker starts, as a JSON list."""
     kubernetes_name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,40}$")] = "hostlens"
     kubernetes_namespace: str | None = None
     """Where the Dask operator makes the pods; the dispatcher's own where None."""
     kubernetes_image: str = "hostlens:latest"
-    kubernetes_memory: str = "4Gi"
+    kubernetes_memory: KubernetesMemory = "4Gi"
     window: Annotated[int, Field(ge=1, le=100_000)] | None = None
     """Runs claimed at most; one per worker thread (or ``batch``), and one more where they are short, where None."""
     batch: Annotated[int, Field(ge=1, le=1000)] = 1
     """Runs that a worker thread is given at a time: more than one where runs take less than about a second."""
-    worker_memory: str = "auto"
+    worker_memory: WorkerMemory = "auto"
     """Memory of a worker of the local cluster, as ``2GiB``; beyond it the worker is ended."""
     worker_lifetime_s: Seconds | None = None
     """A worker older than this is started anew once it is idle, each at its own time within a fifth of it."""
     worker_ttl_s: Annotated[float, Field(ge=10.0, le=86400.0)] = 60.0
     """A local worker that says nothing for so long is started anew."""
 
-    metrics_host: str = "127.0.0.1"
+    metrics_host: Host = "127.0.0.1"
     metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
     """Where the dispatcher shows its metrics; nowhere where None. The API shows its own on its own port."""
 
@@ -109,6 +144,12 @@ class Settings(LogSettings):
     stop_grace_s: Seconds = 15.0
     """How long the supervisor waits for a process to end by itself."""
 
+    @model_validator(mode="before")
+    @classmethod
+    def _environment(cls, values: Any) -> Any:
+        _require_known(frozenset(f"{_PREFIX}{name.upper()}" for name in cls.model_fields))
+        return values
+
     @model_validator(mode="after")
     def _consistent(self) -> Settings:
         if self.leader_ttl_s < 2 * self.heartbeat_s:
@@ -121,6 +162,9 @@ class Settings(LogSettings):
             raise ValueError("HOSTLENS_TLS_CA, HOSTLENS_TLS_CERT and HOSTLENS_TLS_KEY go together")
         if self.tls_ca is not None and self.kind_of_cluster != "address":
             raise ValueError("HOSTLENS_TLS_CA is for a HOSTLENS_SCHEDULER_ADDRESS")
+        encrypted = str(self.scheduler_address).startswith("tls://")
+        if self.scheduler_address is not None and encrypted != (self.tls_ca is not None):
+            raise ValueError("HOSTLENS_SCHEDULER_ADDRESS begins with tls:// where HOSTLENS_TLS_CA is set, only there")
         if self.host not in LOOPBACK and not self.allow_remote:
             raise ValueError(
                 f"HOSTLENS_HOST is {self.host}, which others can reach, and the API asks for no token: "
@@ -132,6 +176,12 @@ class Settings(LogSettings):
     def kind_of_cluster(self) -> ClusterKind:
         """Where the workers are."""
         return self.cluster or ("local" if self.scheduler_address is None else "address")
+
+    @property
+    def url(self) -> str:
+        """Address that the API is reached at from this machine."""
+        everywhere = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - an address to speak to, not to listen at
+        return f"http://{bracketed(everywhere.get(self.host, self.host))}:{self.port}"
 
     @property
     def database(self) -> str:
@@ -151,3 +201,49 @@ class Settings(LogSettings):
     def make_folders(self) -> None:
         """Create the data folder; OSError where that is not allowed."""
         self.data_dir.mkdir(parents=True, exist_ok=True)
+
+
+def bracketed(host: str) -> str:
+    """A host as it stands before a port: an IPv6 address in brackets."""
+    return f"[{host}]" if ":" in host else host
+
+
+def read_settings(kind: type[T] = Settings, **changes: Any) -> T:  # type: ignore[assignment]
+    """The settings of this process; ``changes`` are those that were given on the command line.
+
+    Raises
+    ------
+    ConfigurationError
+        A variable is unknown, empty or not acceptable.
+    """
+    given = {name: value for name, value in changes.items() if value is not None}
+    try:
+        return kind(**given)
+    except ValidationError as error:
+        places = [_place(dict(found), given) for found in error.errors(include_url=False, include_context=False)]
+        raise ConfigurationError("; ".join(places)) from None
+
+
+def _place(found: dict[str, Any], given: dict[str, Any]) -> str:
+    said = str(found["msg"]).removeprefix("Value error, ")
+    if not found["loc"]:
+        return said
+    name = str(found["loc"][0])
+    variable = f"--{name.replace('_', '-')}" if name in given else f"{_PREFIX}{name.upper()}"
+    value = "" if name in _SECRET else f"got {str(found['input'])[:80]!r}; "
+    return f"{variable}: {value}{said[0].lower()}{said[1:]}"
+
+
+def _require_known(settings: frozenset[str]) -> None:
+    """Refuse variables that nobody reads, and empty ones, which would stand for a default that nobody asked for."""
+    known = settings | OTHERS | DEPLOYMENT
+    for variable, value in sorted(os.environ.items()):
+        name = variable.upper()
+        if not name.startswith(_PREFIX) or name.startswith(_FAMILIES):
+            continue
+        if name not in known and not _LINK.search(name) and not ("://" in value and name.endswith("_PORT")):
+            near = get_close_matches(name, known, 1, 0.75)
+            hint = f": did you mean {near[0]}?" if near else "; docs/service.md lists the settings"
+            raise ValueError(f"{variable} is not a setting of hostlens{hint}")
+        if name in settings | {"HOSTLENS_URL"} and not value.strip():
+            raise ValueError(f"{variable} is empty: give it a value, or unset it for the default")

@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -14,9 +13,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 from typing import IO
 
+import httpx
+
+from service import preflight, start
+from service.client import Client, ClientError
 from service.process import PARENT_FD, stop_with_parent
 from service.settings import Settings
 from service.store.migrate import upgrade
@@ -27,6 +30,7 @@ _MAX_DELAY_S = 30.0
 _STEADY_S = 2.0
 """A child that has run for so long could start: when it ends, its next start is not put off."""
 _LOOK_S = 0.05
+_ASK_S = 0.2
 
 
 @dataclass
@@ -39,6 +43,7 @@ class _Child:
     due: float = 0.0
     delay: float = _FIRST_DELAY_S
     starts: int = field(default=0)
+    steady: bool = False
 
 
 class Supervisor:
@@ -62,20 +67,34 @@ class Supervisor:
         os.set_inheritable(self._pipe[0], True)
 
     def prepare(self) -> None:
-        """Create the data folder and bring the database up to date."""
-        self._settings.make_folders()
+        """Look whether all is there, create the data folder and bring the database up to date.
+
+        Raises
+        ------
+        service.settings.ConfigurationError
+            Something is not there, or belongs to somebody else.
+        """
+        preflight.for_both(self._settings)
         upgrade(self._settings.database)
 
-    def run(self, stop: Event, started: Callable[[], None] = lambda: None) -> None:
-        """Start the processes and keep them running until ``stop`` is set; none is left afterwards."""
+    def run(self, stop: Event, serves: Callable[[], None] = lambda: None) -> int:
+        """Start the processes and keep them running until ``stop`` is set; none is left afterwards.
+
+        ``serves`` is called, from another thread, once requests are answered and somebody dispatches. The exit code is
+        0, or that of a child that could not start for its configuration: the next start would end in the same way.
+        """
+        ended = Event()
         try:
             for child in self._children:
                 self._start(child)
-            started()
+            Thread(target=self._announce, args=(ended, serves), name="announce", daemon=True).start()
             while not stop.wait(_LOOK_S):
                 for child in self._children:
-                    self._look_after(child)
+                    if self._look_after(child) == start.CONFIGURATION:
+                        return start.CONFIGURATION
+            return 0
         finally:
+            ended.set()
             self._end_all()
 
     def pids(self) -> dict[str, int]:
@@ -84,7 +103,7 @@ class Supervisor:
 
     def _start(self, child: _Child) -> None:
         environment = {**os.environ, PARENT_FD: str(self._pipe[0]), **_as_environment(self._settings)}
-        with self._log(child) as log:
+        with self._log(child) as log, start.kept_back():
             child.process = subprocess.Popen(
                 [sys.executable, "-m", child.module],
                 env=environment,
@@ -107,21 +126,39 @@ class Supervisor:
         with (self._log_folder / f"{child.module}.log").open("ab") as log:
             yield log
 
-    def _look_after(self, child: _Child) -> None:
+    def _announce(self, ended: Event, serves: Callable[[], None]) -> None:
+        """Ask until the service answers and has a leader, be it one of another machine."""
+        with Client(self._settings.url) as client:
+            while not ended.wait(_ASK_S):
+                try:
+                    if client.readiness().dispatcher != "ok":
+                        continue
+                except (ClientError, httpx.RequestError):
+                    continue
+                serves()
+                return
+
+    def _look_after(self, child: _Child) -> int | None:
+        """Start a child that is due; the exit code of one that has just ended and never ran well."""
         if child.process is None:
             if time.monotonic() >= child.due:
                 self._start(child)
-            return
+            return None
         if not _has_ended(child.process):
-            return
+            return None
         _end_group(child.process)
         code = child.process.wait()
         child.process = None
         if time.monotonic() - child.started > _STEADY_S:
             child.delay = 0.0
+            child.steady = True
+        if code == start.CONFIGURATION and not child.steady:
+            _LOG.error("%s cannot start: its last line says why", child.module)
+            return code
         _LOG.warning("%s ended with %d; next start in %.1f s", child.module, code, child.delay)
         child.due = time.monotonic() + child.delay
         child.delay = min(max(2 * child.delay, _FIRST_DELAY_S), _MAX_DELAY_S)
+        return None
 
     def _end_all(self) -> None:
         running = [child.process for child in self._children if child.process is not None]
@@ -162,24 +199,13 @@ def _as_environment(settings: Settings) -> dict[str, str]:
     return {f"HOSTLENS_{name.upper()}": value for name, value in plain.items()}
 
 
-def require_free(settings: Settings) -> None:
-    """Ask for the port before anything is started; OSError where another process has it.
-
-    Otherwise the API would be started again and again beside the one that is already there.
-    """
-    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    with socket.socket(family) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((settings.host, settings.port))
-
-
-def serve(settings: Settings, started: Callable[[], None] = lambda: None) -> None:
-    """Run API and dispatcher until SIGINT or SIGTERM; OSError where the port is taken."""
-    stop = Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+def serve(settings: Settings, serves: Callable[[], None] = lambda: None) -> int:
+    """Run API and dispatcher until SIGINT or SIGTERM; the exit code, as :meth:`Supervisor.run`."""
     stop_with_parent()
-    require_free(settings)
     supervisor = Supervisor(settings)
+    # A signal meanwhile ends this process at once; a migration is a transaction, and does not happen then.
     supervisor.prepare()
-    supervisor.run(stop, started)
+    stop = Event()
+    for number in start.STOPS:
+        signal.signal(number, lambda *_: stop.set())
+    return supervisor.run(stop, serves)

@@ -37,7 +37,7 @@ def summary_table(summary: Summary) -> Table:
     table = Table(title=f"Grid {summary.grid_id}\n{summary.n_stored} of {summary.n_runs} runs stored")
     table.add_column("input")
     table.add_column("quantity")
-    for title in ("true", "recovered ± sd", "bias"):
+    for title in ("true", "recovered +- sd", "bias"):
         table.add_column(title, justify="right", no_wrap=True)
     for row in summary.rows:
         named = [f"{row.input['system']} ({row.n_runs} run{'s' * (row.n_runs > 1)})"]
@@ -51,7 +51,7 @@ def summary_table(summary: Summary) -> Table:
                 continue
             value = value_of(found, quantity)
             true, bias = _number(value.input, "{:g}"), _number(value.bias, "{:+.3f}")
-            table.add_row(cell, title, true, f"{value.mean:.3f} ± {value.sd:.3f}", bias, end_section=last)
+            table.add_row(cell, title, true, f"{value.mean:.3f} +- {value.sd:.3f}", bias, end_section=last)
     table.caption = (
         "bias: recovered minus true; sd: spread of the draws of a run; by the image estimator where none is named; "
         "n in 1-4 for paper"

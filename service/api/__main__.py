@@ -1,7 +1,11 @@
 """``python -m service.api``: the API process, as the supervisor starts it."""
 
-from service.api.serve import serve
-from service.settings import Settings
+from service import start
 
 if __name__ == "__main__":
-    serve(Settings())
+    start.begin()
+    from service.api.serve import serve
+    from service.settings import read_settings
+
+    with start.refusing():
+        serve(read_settings())

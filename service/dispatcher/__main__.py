@@ -4,17 +4,25 @@ import gc
 import os
 import sys
 
+from service import start
+
 # Dask's workers import this module again when they are started; only the process itself dispatches.
 if __name__ == "__main__":
+    start.begin()
     # Until everything is loaded; dispatch() turns it on again.
     gc.disable()
     # Asked for in plain, because to load what reads settings takes a tenth of the time that workers wait for.
-    if os.environ.get("HOSTLENS_CLUSTER", "local") == "local" and "HOSTLENS_SCHEDULER_ADDRESS" not in os.environ:
-        from service.dispatcher.nursery import open_nursery
+    from service.dispatcher.nursery import close_nursery, open_nursery
 
+    start.on_early_end(close_nursery)
+    if os.environ.get("HOSTLENS_CLUSTER", "local") == "local" and "HOSTLENS_SCHEDULER_ADDRESS" not in os.environ:
         # Before all else, so that it loads while this process does; without this, dispatch() opens it.
         open_nursery()
     from service.dispatcher.process import dispatch
-    from service.settings import Settings
+    from service.settings import read_settings
 
-    sys.exit(dispatch(Settings()))
+    try:
+        with start.refusing():
+            sys.exit(dispatch(read_settings()))
+    finally:
+        close_nursery()

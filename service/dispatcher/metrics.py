@@ -18,7 +18,7 @@ from prometheus_client import (
 
 from service import logs
 from service.payload import ResultPayload
-from service.settings import Settings
+from service.settings import ConfigurationError, Settings
 from service.store.database import AWAY
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored
@@ -62,11 +62,16 @@ class DispatcherMetrics:
 
     @contextmanager
     def serving(self, settings: Settings) -> Iterator[None]:
-        """Answer on the metrics port while the context lasts; OSError where another process has it."""
+        """Answer on the metrics port while the context lasts; a ConfigurationError where another process has it."""
         if settings.metrics_port is None:
             yield
             return
-        server, thread = start_http_server(settings.metrics_port, settings.metrics_host, self.registry)
+        try:
+            server, thread = start_http_server(settings.metrics_port, settings.metrics_host, self.registry)
+        except OSError as error:
+            raise ConfigurationError(
+                f"HOSTLENS_METRICS_PORT: cannot listen on {settings.metrics_port}: {error}"
+            ) from None
         try:
             yield
         finally:

@@ -11,12 +11,12 @@ from types import FrameType
 
 from sqlalchemy.exc import DBAPIError
 
-from service import logs
+from service import logs, preflight
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.holder import is_dead, own_name
 from service.dispatcher.loop import Dispatcher
 from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
-from service.dispatcher.nursery import open_nursery
+from service.dispatcher.nursery import close_nursery, open_nursery
 from service.dispatcher.pool import Pool, open_pool
 from service.process import spare_collector, stop_with_parent
 from service.settings import Settings
@@ -31,10 +31,13 @@ _FIRST_DELAY_S, _MAX_DELAY_S, _STEADY_S = 0.5, 30.0, 30.0
 
 
 def dispatch(settings: Settings) -> int:
-    """Dispatch until SIGINT or SIGTERM, or until this process no longer can; the exit code says which."""
-    logs.configure(settings, "dispatcher")
-    # Dask says at INFO and WARNING what is normal here: workers that come and go with us.
-    logging.getLogger("distributed").setLevel(logging.ERROR)
+    """Dispatch until SIGINT or SIGTERM, or until this process no longer can; the exit code says which.
+
+    Raises
+    ------
+    service.settings.ConfigurationError
+        What the settings name is not there or cannot be used.
+    """
     stop = Event()
 
     def on_signal(_number: int, _frame: FrameType | None) -> None:
@@ -43,14 +46,20 @@ def dispatch(settings: Settings) -> int:
     signal.signal(signal.SIGTERM, on_signal)
     signal.signal(signal.SIGINT, on_signal)
     stop_with_parent()
-    settings.make_folders()
+    logs.configure(settings, "dispatcher")
+    # Dask says at INFO and WARNING what is normal here: workers that come and go with us.
+    logging.getLogger("distributed").setLevel(logging.ERROR)
+    preflight.for_dispatcher(settings)
     if settings.kind_of_cluster == "local":
         open_nursery()
     # Each result is a hundred objects, and Dask makes much that it would look through again and again.
     spare_collector()
     metrics = DispatcherMetrics()
-    with metrics.serving(settings):
-        return _dispatch(settings, metrics, stop)
+    try:
+        with metrics.serving(settings):
+            return _dispatch(settings, metrics, stop)
+    finally:
+        close_nursery()
 
 
 def _dispatch(settings: Settings, metrics: DispatcherMetrics, stop: Event) -> int:

@@ -10,10 +10,12 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
+import httpx
 from rich.console import Console
 from rich.table import Table
 
-from service.drills.drill import Drill, OccupiedError, ground
+from service.client import ClientError
+from service.drills.drill import Drill, OccupiedError, SizeError, ground
 from service.drills.installation import DrillError
 from service.drills.kills import DispatcherKills, SchedulerKills, WorkerKills
 from service.drills.outages import DiskFull, PostgresKills, SqliteLock
@@ -60,20 +62,18 @@ def drills_table() -> Table:
 def carry_out(
     console: Console, name: str, *, sizes: Sequence[str], small: bool, database_url: str | None, json_file: Path | None
 ) -> int:
-    """Carry out a drill; 0 if its claims hold, 1 if one does not, 2 if it could not be carried out."""
+    """Carry out a drill; 0 if its claims hold, 1 if one does not; a DrillError where it could not be carried out."""
     if name == "list":
         console.print(drills_table())
         return 0
     if name not in DRILLS:
-        console.print(f"there is no drill {name}: there are {', '.join(DRILLS)}", markup=False, soft_wrap=True)
-        return 2
+        raise DrillError(f"there is no drill {name}: there are {', '.join(DRILLS)}")
     try:
         drill = DRILLS[name].sized(dict(size.split("=", 1) for size in sizes), small=small)
         with _interruptible(), ground(database_url) as place:
             report = drill.run(place)
-    except (DrillError, OccupiedError, ValueError) as error:
-        console.print(f"drill {name}: {error}", markup=False, highlight=False, soft_wrap=True)
-        return 2
+    except (DrillError, ClientError, httpx.RequestError, OccupiedError, SizeError) as error:
+        raise DrillError(f"drill {name}: {error}") from error
     console.print(report.table())
     if json_file is not None:
         json_file.write_text(report.to_json() + "\n", encoding="utf-8")

@@ -54,10 +54,15 @@ class Ground:
         return self.backend == "SQLite" or self.server is not None
 
 
+class SizeError(ValueError):
+    """A drill has no such size, or the size is not one."""
+
+
 class OccupiedError(ValueError):
     """A drill was pointed at a database that holds somebody's grids."""
 
 
+_MOST = 10_000_000
 THROW_AWAY = "postgresql"
 """Instead of a database's URL: a PostgreSQL server that is started for the drill and leaves nothing."""
 
@@ -109,15 +114,18 @@ class Drill(ABC):
 
     @classmethod
     def sized(cls, changes: dict[str, str], *, small: bool) -> Self:
-        """A drill with its default or small sizes and with some of them changed; ValueError names what is wrong."""
+        """A drill with its default or small sizes and with some of them changed; a SizeError names what is wrong."""
         known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
         sizes: dict[str, Any] = dict(cls.small) if small else {}
         for name, value in changes.items():
             if name not in known:
-                raise ValueError(f"drill {cls.name} has no size {name}: it has {', '.join(known) or 'none'}")
+                raise SizeError(f"drill {cls.name} has no size {name}: it has {', '.join(known) or 'none'}")
             kind: Callable[[str], Any] = type(known[name].default)
             try:
                 sizes[name] = kind(value)
             except ValueError:
-                raise ValueError(f"{name}: got {value!r}, allowed is a number") from None
+                raise SizeError(f"{name}: got {value!r}, allowed is a number") from None
+            least = 1 if kind is int and known[name].default else 0
+            if not least <= sizes[name] <= _MOST:
+                raise SizeError(f"{name}: got {value!r}, allowed is a number from {least} to {_MOST:g}")
         return cls(**sizes)

@@ -124,8 +124,8 @@ def _spent(service: Installation) -> dict[str, float]:
     """CPU seconds so far of the processes by what they are."""
     spent = dict.fromkeys(("workers", "nannies", "scheduler", "dispatcher", "API", "supervisor"), 0.0)
     kinds = {
-        ("dask", "worker"): "nannies",
-        ("dask", "scheduler"): "scheduler",
+        ("service.dispatcher.dask_command", "worker"): "nannies",
+        ("service.dispatcher.dask_command", "scheduler"): "scheduler",
         ("service.dispatcher",): "dispatcher",
         ("service.api",): "API",
         ("service", "serve"): "supervisor",

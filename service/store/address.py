@@ -46,6 +46,10 @@ class AddressError(ValueError):
     """A database URL that is not acceptable; the text is one line without the password."""
 
 
+class DriverMissingError(AddressError):
+    """PostgreSQL without the extra that brings its driver: nothing can be said of the URL's options."""
+
+
 @dataclass(frozen=True)
 class SqliteAddress:
     """A file, and SQLite's own options for it."""
@@ -115,7 +119,7 @@ def _postgres(url: URL, hosts: list[str]) -> PostgresAddress:
     try:
         from psycopg.pq import Conninfo  # noqa: PLC0415 - an extra
     except ImportError as error:
-        raise AddressError(f"PostgreSQL needs hostlens with its extra postgres: {error}") from None
+        raise DriverMissingError(f"PostgreSQL needs hostlens with its extra postgres: {error}") from None
     known = {option.keyword.decode() for option in Conninfo.get_defaults()}
     query = dict(url.query)
     given = query.pop("host", ())

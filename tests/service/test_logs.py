@@ -86,7 +86,7 @@ def test_a_level_may_be_written_small_and_an_unknown_one_is_refused() -> None:
 
 def test_every_process_tells_of_a_run_with_its_grid_attempt_and_generation(tmp_path: Path) -> None:
     settings = {"HOSTLENS_LOG_FORMAT": "json", "HOSTLENS_TASK": "tests.service.tasks:moody"}
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0", HOSTLENS_RETRY_DELAY_S="0.1", **settings) as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0", HOSTLENS_RETRY_DELAY_S="0.1", **settings) as service:
         grid = service.client.submit(body(4))
         service.client.wait(grid.id, timeout_s=60)
         runs = {run.ordinal: run.id for run in service.client.runs(grid.id)}

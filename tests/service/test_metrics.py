@@ -182,7 +182,7 @@ def test_what_becomes_of_runs_is_counted_after_it_was_committed(database: Databa
 def test_a_grid_moves_the_counters_of_both_processes(tmp_path: Path) -> None:
     port = free_port()
     settings = {"HOSTLENS_METRICS_PORT": str(port), "HOSTLENS_TASK": "tests.service.tasks:moody"}
-    with serving(tmp_path, HOSTLENS_TEST_SLEEP="0", HOSTLENS_RETRY_DELAY_S="0.1", **settings) as service:
+    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0", HOSTLENS_RETRY_DELAY_S="0.1", **settings) as service:
         grid = service.client.submit(body(6))
         service.client.wait(grid.id, timeout_s=60)
 

@@ -174,8 +174,8 @@ def test_settings_are_checked_at_the_door(monkeypatch: pytest.MonkeyPatch) -> No
         Settings(leader_ttl_s=5, heartbeat_s=5)
     monkeypatch.setenv("HOSTLENS_PORT", "99999")
     outcome = CliRunner().invoke(app, ["status"])
-    assert outcome.exit_code == 1
-    assert "port" in outcome.output
+    assert outcome.exit_code == 2
+    assert "HOSTLENS_PORT: got '99999'" in outcome.output
 
 
 def test_the_command_line_speaks_to_the_api(tmp_path: Path, sqlite_url: str, monkeypatch: pytest.MonkeyPatch) -> None:

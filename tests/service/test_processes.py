@@ -172,8 +172,8 @@ def test_a_second_service_on_the_same_port_says_so_and_starts_nothing(tmp_path: 
             timeout=30,
             check=False,
         )
-        assert second.returncode == 1
-        assert "cannot serve" in second.stderr
+        assert second.returncode == 2
+        assert "HOSTLENS_PORT: cannot listen" in second.stderr
 
 
 def test_a_second_dispatcher_stands_by_and_claims_nothing(tmp_path: Path) -> None:

@@ -1,0 +1,116 @@
+"""The first thing in every process of the service, before anything that takes time to load.
+
+It loads next to nothing itself, so that a signal at any moment of a start ends the process as promised: a service that
+was told to stop has done what it was told (0), a command that was told to stop has not done its work (130, 143).
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+CONFIGURATION = 2
+"""Exit code of what is asked for and cannot be: another start would end in the same way."""
+STOPS = (signal.SIGINT, signal.SIGTERM)
+_left_behind: list[Callable[[], None]] = []
+
+
+def begin(*, service: bool = True) -> None:
+    """Make standard streams that are closed, a home that is missing, and the handlers of the signals that end it.
+
+    They are in force until the process puts its own in their place. Whoever started it may have kept the signals
+    back until now.
+    """
+    _open_streams()
+    _name_a_home()
+    finish(service=service)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+
+
+def finish(*, service: bool) -> None:
+    """From now on a signal ends the process at once: there is nothing to clean up yet, or any more."""
+    for number in STOPS:
+        signal.signal(number, _end_well if service else _end_early)
+
+
+def interruptible() -> None:
+    """From now on a signal unwinds what a command is at, so that it can clean up."""
+
+    def terminated(_number: int, _frame: FrameType | None) -> NoReturn:
+        sys.exit(128 + signal.SIGTERM)
+
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, terminated)
+
+
+def on_early_end(end: Callable[[], None]) -> None:
+    """Call ``end`` if a signal comes before the process handles it itself: a process that it has started, say."""
+    _left_behind.append(end)
+
+
+@contextmanager
+def kept_back() -> Iterator[None]:
+    """Hold these signals back in the processes that are started meanwhile, until they ``begin``.
+
+    Python itself takes a while before the first line of a program, and would die of them.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOPS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Say in one line what is wrong with the configuration, and end with the code for it."""
+    from service.settings import ConfigurationError  # noqa: PLC0415 - takes a while to load
+
+    try:
+        yield
+    except ConfigurationError as error:
+        print(f"hostlens: {error}", file=sys.stderr)
+        sys.exit(CONFIGURATION)
+
+
+def _end_well(_number: int, _frame: FrameType | None) -> NoReturn:
+    _end(0)
+
+
+def _end_early(number: int, _frame: FrameType | None) -> NoReturn:
+    _end(128 + number)
+
+
+def _end(code: int) -> NoReturn:
+    for end in _left_behind:
+        end()
+    # Not sys.exit: a library that is being loaded might catch it.
+    os._exit(code)
+
+
+def _open_streams() -> None:
+    """Put the null device where a standard stream is closed, or the next file to be opened would take its number.
+
+    What is then written to standard error, by whichever library, would be written into that file: the database, say.
+    A character that the terminal's encoding lacks is written as a question mark.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
+        stream = getattr(sys, name)
+        if number and hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+
+
+def _name_a_home() -> None:
+    """As :mod:`engine.home` does, for what is loaded without the engine."""
+    if os.path.expanduser("~") == "~":
+        os.environ["HOME"] = "/nonexistent"
