@@ -183,7 +183,7 @@ def test_what_the_settings_name_is_looked_at_before_a_start(tmp_path: Path, monk
     tls = {"tls_ca": file, "tls_cert": file, "tls_key": file, "scheduler_address": "tls://x:1"}
     assert "HOSTLENS_TLS_CA" in refusal(Settings.model_validate({"data_dir": data, "port": port, **tls}))
     assert "HOSTLENS_TASK: there is no module" in refusal(Settings(data_dir=data, port=port, task="no.such:task"))
-    monkeypatch.setitem(sys.modules, "psycopg", None)
+    monkeypatch.setitem(sys.modules, "psycopg.pq", None)
     remote = Settings(data_dir=data, port=port, database_url="postgresql://h/x")
     assert "HOSTLENS_DATABASE_URL: PostgreSQL needs hostlens with its extra postgres" in refusal(remote)
     monkeypatch.setitem(sys.modules, "dask_jobqueue.slurm", None)
