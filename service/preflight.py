@@ -24,6 +24,7 @@ import psutil
 from service.settings import ConfigurationError, Settings, bracketed
 from service.store.address import AddressError, SqliteAddress, read_address
 
+API_PORT = "HOSTLENS_HOST and HOSTLENS_PORT"
 _EXTRAS = {"slurm": "dask_jobqueue.slurm", "kubernetes": "dask_kubernetes.operator"}
 _AWAY = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE})
 """A disk that is full or away for now: that a later start may find otherwise."""
@@ -103,17 +104,27 @@ def require_certificates(settings: Settings) -> None:
         raise ConfigurationError(f"{variables}: not PEM files that can be used ({error})") from None
 
 
-def require_free(host: str, port: int, variables: str) -> None:
-    """A process can listen there: nobody else does, and the host is one of this machine."""
+def listening(host: str, port: int, variables: str) -> socket.socket:
+    """A socket that listens there: nobody else does, and the host is one of this machine."""
+    listener = None
     try:
         (family, kind, _, _, address), *_ = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-        with socket.socket(family, kind) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-            probe.listen()
+        listener = socket.socket(family, kind)
+        # Connections of an earlier service that are not forgotten yet are no reason to wait.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen()
     except (OSError, UnicodeError) as error:
+        if listener is not None:
+            listener.close()
         said = getattr(error, "strerror", None) or error
         raise ConfigurationError(f"{variables}: cannot listen on {bracketed(host)}:{port} ({said})") from None
+    return listener
+
+
+def require_free(host: str, port: int, variables: str) -> None:
+    """A process can listen there."""
+    listening(host, port, variables).close()
 
 
 def for_api(settings: Settings) -> None:
@@ -122,7 +133,6 @@ def for_api(settings: Settings) -> None:
         require_data(settings)
     require_database(settings)
     require_artefacts(settings)
-    require_free(settings.host, settings.port, "HOSTLENS_HOST and HOSTLENS_PORT")
 
 
 def for_dispatcher(settings: Settings) -> None:
@@ -140,6 +150,7 @@ def for_both(settings: Settings) -> None:
     if settings.metrics_port == settings.port:
         raise ConfigurationError(f"HOSTLENS_METRICS_PORT and HOSTLENS_PORT are both {settings.port}: they must differ")
     for_api(settings)
+    require_free(settings.host, settings.port, API_PORT)
     for_dispatcher(settings)
 
 

@@ -6,9 +6,16 @@ import gc
 import os
 import signal
 import threading
+from socket import socket
 
 PARENT_FD = "HOSTLENS_PARENT_FD"
 """Names the pipe whose other end only the supervisor holds."""
+LISTENER_FD = "HOSTLENS_LISTENER_FD"
+"""Names the socket that the supervisor listens on, for its API processes to accept from."""
+API_NUMBER = "HOSTLENS_API_NUMBER"
+"""Which of several API processes this one is: its next start goes on with its metrics."""
+METRICS_DIR = "PROMETHEUS_MULTIPROC_DIR"
+"""Where API processes keep their metrics, so that each can tell those of all; the variable is Prometheus's own."""
 
 
 def spare_collector() -> None:
@@ -21,6 +28,12 @@ def spare_collector() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
+
+
+def inherited_listener() -> socket | None:
+    """The socket that a supervisor listens on for this process; None where there is none."""
+    descriptor = os.environ.pop(LISTENER_FD, None)
+    return None if descriptor is None else socket(fileno=int(descriptor))
 
 
 def stop_with_parent() -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.process import PARENT_FD
+from service.process import API_NUMBER, LISTENER_FD, PARENT_FD
 from service.setting_types import (
     ArtefactUrl,
     ClusterKind,
@@ -29,7 +29,7 @@ from service.setting_types import (
 )
 
 _PREFIX = "HOSTLENS_"
-OTHERS = frozenset({"HOSTLENS_URL", PARENT_FD})
+OTHERS = frozenset({"HOSTLENS_URL", PARENT_FD, LISTENER_FD, API_NUMBER})
 """Variables that are no settings: of the command line's client, of the supervisor for its children."""
 DEPLOYMENT = frozenset(
     f"HOSTLENS_{name}" for name in ("DB_PASSWORD", "TAG", "SHARED", "SCHEDULER_HOST", "SCHEDULER_PORT")
@@ -85,6 +85,14 @@ class Settings(LogSettings):
     """Let the API listen beyond loopback. There are no tokens yet: whoever reaches the port may submit."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 1_000_000
     max_grid_runs: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
+    api_processes: Annotated[int, Field(ge=1, le=64)] = 2
+    """API processes that ``hostlens serve`` starts on the one port; the three limits below hold in each."""
+    max_connections: Annotated[int, Field(ge=16, le=100_000)] = 1000
+    """More are answered 503; the probes are not."""
+    max_streams: Annotated[int, Field(ge=1, le=100_000)] = 500
+    """Event streams and long polls that wait at a time; more are answered 429."""
+    request_timeout_s: Seconds = 30.0
+    """A request has to come whole within so long, and an answer to be taken on with: the connection is closed."""
 
     task: Annotated[str, Field(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")] = "service.worker:execute"
     """What a worker runs for a run, as ``module:function``."""

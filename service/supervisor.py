@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,7 +22,7 @@ import httpx
 
 from service import preflight, start
 from service.client import Client, ClientError
-from service.process import PARENT_FD, stop_with_parent
+from service.process import API_NUMBER, LISTENER_FD, METRICS_DIR, PARENT_FD, stop_with_parent
 from service.settings import Settings
 from service.store.migrate import upgrade
 
@@ -31,6 +33,8 @@ _STEADY_S = 2.0
 """A child that has run for so long could start: when it ends, its next start is not put off."""
 _LOOK_S = 0.05
 _ASK_S = 0.2
+_BACKLOG = 2048
+API = "service.api"
 
 
 @dataclass
@@ -38,6 +42,8 @@ class _Child:
     """One supervised process and how it has been doing."""
 
     module: str
+    number: int = 0
+    """Among those of its module."""
     process: subprocess.Popen[bytes] | None = None
     started: float = 0.0
     due: float = 0.0
@@ -49,6 +55,10 @@ class _Child:
 class Supervisor:
     """Keeps the processes of one machine running.
 
+    There may be several API processes. All accept from one socket, which is listened on here: a connection goes to
+    whichever is free, and while one starts again those that came for it wait. Their metrics lie in files, so that any
+    of them tells those of all.
+
     Each child leads a process group of its own: Ctrl-C in a terminal reaches the supervisor alone, and whatever a
     dead dispatcher leaves behind (Dask's workers) can be ended with it. Each child also watches a pipe from here, so
     that it ends when the supervisor is killed.
@@ -57,12 +67,17 @@ class Supervisor:
     def __init__(
         self,
         settings: Settings,
-        modules: tuple[str, ...] = ("service.api", "service.dispatcher"),
+        modules: tuple[str, ...] = (API, "service.dispatcher"),
         log_folder: Path | None = None,
     ) -> None:
         self._settings = settings
         self._log_folder = log_folder
-        self._children = [_Child(module) for module in modules]
+        counts = {API: settings.api_processes}
+        self._children = [_Child(module, number) for module in modules for number in range(counts.get(module, 1))]
+        self._serves_api = API in modules
+        self._listener: socket.socket | None = None
+        several = settings.api_processes > 1
+        self._metrics = settings.data_dir.absolute() / f"metrics-{settings.port}" if several else None
         self._pipe = os.pipe()
         os.set_inheritable(self._pipe[0], True)
 
@@ -85,6 +100,7 @@ class Supervisor:
         """
         ended = Event()
         try:
+            self._settle()
             for child in self._children:
                 self._start(child)
             Thread(target=self._announce, args=(ended, serves), name="announce", daemon=True).start()
@@ -97,12 +113,29 @@ class Supervisor:
             ended.set()
             self._end_all()
 
-    def pids(self) -> dict[str, int]:
-        """Process numbers by module, of those that have been started."""
-        return {child.module: child.process.pid for child in self._children if child.process is not None}
+    def _settle(self) -> None:
+        """Listen, and take away what API processes of an earlier time have left of their metrics."""
+        if self._serves_api:
+            self._listener = preflight.listening(self._settings.host, self._settings.port, preflight.API_PORT)
+            self._listener.listen(_BACKLOG)
+        if self._metrics is not None:
+            shutil.rmtree(self._metrics, ignore_errors=True)
+            self._metrics.mkdir(parents=True)
+
+    def _given(self, child: _Child) -> tuple[dict[str, str], tuple[int, ...]]:
+        """What a child is told of its siblings and of this process, and the descriptors that it takes over."""
+        environment = {PARENT_FD: str(self._pipe[0])}
+        descriptors: tuple[int, ...] = (self._pipe[0],)
+        if child.module == API and self._listener is not None:
+            descriptors += (self._listener.fileno(),)
+            environment[LISTENER_FD] = str(self._listener.fileno())
+            if self._metrics is not None:
+                environment |= {API_NUMBER: str(child.number), METRICS_DIR: str(self._metrics)}
+        return environment, descriptors
 
     def _start(self, child: _Child) -> None:
-        environment = {**os.environ, PARENT_FD: str(self._pipe[0]), **_as_environment(self._settings)}
+        given, descriptors = self._given(child)
+        environment = {**os.environ, **given, **_as_environment(self._settings)}
         with self._log(child) as log, start.kept_back():
             child.process = subprocess.Popen(
                 [sys.executable, "-m", child.module],
@@ -110,7 +143,7 @@ class Supervisor:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                pass_fds=(self._pipe[0],),
+                pass_fds=descriptors,
                 start_new_session=True,
             )
         child.started = time.monotonic()
@@ -173,6 +206,10 @@ class Supervisor:
             process.wait()
         for end in self._pipe:
             os.close(end)
+        if self._listener is not None:
+            self._listener.close()
+        if self._metrics is not None:
+            shutil.rmtree(self._metrics, ignore_errors=True)
 
 
 def _has_ended(process: subprocess.Popen[bytes]) -> bool:

@@ -8,10 +8,10 @@ from typing import Any
 
 from fastapi import Request, Response
 from fastapi.concurrency import run_in_threadpool
-from fastapi.routing import APIRoute
 
 from engine import read_json
 from service.api.problems import InvalidRequestError, UnsupportedBodyError
+from service.api.threads import Route
 
 _CHARSETS = frozenset({"utf-8", "utf8"})
 
@@ -32,7 +32,7 @@ class _ReadRequest(Request):
         return self._read[1]
 
 
-class JsonRoute(APIRoute):
+class JsonRoute(Route):
     """A route that takes a body only as JSON."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:

@@ -13,16 +13,17 @@ from service.schemas import CameraList, EngineView, SystemList, SystemView
 from service.store.grids import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["catalogue"])
+# Its handlers are no threads' work: what they give was read with the engine.
 
 
 @router.get("/systems")
-def systems() -> SystemList:
+async def systems() -> SystemList:
     """The lens systems that a grid may name."""
     return SystemList(items=list_systems())
 
 
 @router.get("/systems/{name}")
-def system(name: Annotated[str, Path(max_length=64)]) -> SystemView:
+async def system(name: Annotated[str, Path(max_length=64)]) -> SystemView:
     """One lens system with source and confidence of every number."""
     try:
         return system_view(name)
@@ -31,12 +32,12 @@ def system(name: Annotated[str, Path(max_length=64)]) -> SystemView:
 
 
 @router.get("/cameras")
-def cameras() -> CameraList:
+async def cameras() -> CameraList:
     """The cameras of the catalogue."""
     return CameraList(items=list_cameras())
 
 
 @router.get("/engine")
-def engine() -> EngineView:
+async def engine() -> EngineView:
     """Which engine this process carries, and the presets that it knows."""
     return engine_view(VERSION)

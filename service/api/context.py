@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import Depends, Path, Query, Request
 
 from service import logs
+from service.api.hub import Hub
 from service.api.metrics import ApiMetrics
 from service.artefacts import ArtefactStore
 from service.identifiers import GRID_PATTERN, RUN_PATTERN
@@ -27,12 +28,15 @@ class Context:
         self.database = Database(settings.database)
         self.grids = GridStore(self.database)
         self.events = EventStore(self.database)
-        self.leadership = Leadership(self.database, settings.leader_ttl_s)
+        self.hub = Hub(self.events, settings.max_streams)
+        # A connection of their own each time, or probes would queue behind whoever waits for the database already.
+        self.probed = Database(settings.database, pooled=False)
+        self.leadership = Leadership(self.probed, settings.leader_ttl_s)
         self.metrics = ApiMetrics(self.database)
         self.artefacts = ArtefactStore(settings.artefacts)
 
 
-def _context(request: Request) -> Context:
+async def _context(request: Request) -> Context:
     context = request.app.state.context
     if not isinstance(context, Context):
         raise TypeError(type(context))

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from collections.abc import AsyncIterator
+from contextlib import ExitStack
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Request, Response
-from fastapi.concurrency import run_in_threadpool
+from fastapi import APIRouter, Header, HTTPException, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from fastapi.sse import KEEPALIVE_COMMENT, format_sse_event
+from starlette.types import Receive, Scope, Send
 
 from service.api.context import Context, GridId, Limit, Service
+from service.api.hub import Feed, FullError
 from service.api.pages import next_link
+from service.api.threads import QUICK, Route, run_in
 from service.schemas import EventPage
 
-router = APIRouter(prefix="/v1", tags=["grids"])
-_LOOK_S = 0.5
+router = APIRouter(prefix="/v1", tags=["grids"], route_class=Route)
 _KEEP_ALIVE_S = 15.0
-_BATCH = 1000
+_BATCH = 100
 _STREAM = "text/event-stream"
 _MAX_NUMBER = 2**62
 Number = Annotated[int, Query(ge=0, le=_MAX_NUMBER, description="Number of the last event that was seen")]
@@ -48,47 +48,68 @@ async def list_events(
 
     With ``wait`` an answer without events is held back until there is one or the grid has ended. With ``Accept:
     text/event-stream`` a stream: first an event ``grid`` with the whole state (unless Last-Event-ID resumes an earlier
-    stream), then each event under its kind, to the end of the grid.
+    stream), then each event under its kind, to the end of the grid. As many streams and long polls may wait as a
+    setting says; others are answered 429.
     """
-    if _STREAM in request.headers.get("accept", ""):
-        return await _stream(service, grid_id, last_event_id)
-    page = await _await_events(service, grid_id, cursor, limit, wait)
+    try:
+        if _STREAM in request.headers.get("accept", ""):
+            return await _stream(service, grid_id, last_event_id)
+        page = await _await_events(service, grid_id, cursor, limit, wait)
+    except FullError as error:
+        raise HTTPException(429, str(error), headers={"Retry-After": "5"}) from error
     return page.model_copy(update={"next": next_link(request, response, page.next)})
 
 
 async def _await_events(service: Context, grid_id: str, after: int, limit: int, wait: float) -> EventPage:
-    until = time.monotonic() + wait
-    while True:
-        # The waiting is done here and not in a thread: there are few of those, and they serve everybody else.
-        page = await run_in_threadpool(service.events.page, grid_id, after, limit)
-        left = until - time.monotonic()
-        if page.items or page.ended or left <= 0:
-            return page
-        await asyncio.sleep(min(_LOOK_S, left))
+    page = await run_in(QUICK, service.events.page, grid_id, after, limit)
+    if page.items or page.ended or not wait:
+        return page
+    with service.hub.follow(grid_id) as feed:
+        news = await feed.next(after, limit, wait)
+    cursor = news.told[-1].number if news.told else after
+    # Where a page is full there may be more, which costs who asks an empty answer at worst.
+    more = str(cursor) if len(news.told) == limit and not news.ended else None
+    return EventPage(items=[told.view for told in news.told], cursor=cursor, ended=news.ended, next=more)
 
 
 async def _stream(service: Context, grid_id: str, after: int | None) -> Response:
-    first = []
-    if after is None:
-        # The number before the state: what comes between the two is told twice and not lost.
-        after = await run_in_threadpool(service.events.latest, grid_id)
-        grid = await run_in_threadpool(service.grids.grid, grid_id)
-        first = [format_sse_event(event="grid", id=str(after), data_str=grid.model_dump_json())]
-    page = await run_in_threadpool(service.events.page, grid_id, after, _BATCH)
-    if page.ended and not page.items and not first:
-        return Response(status_code=204)
-    chunks = _chunks(service, grid_id, first, page)
-    return StreamingResponse(chunks, media_type=_STREAM, headers={"Cache-Control": "no-store"})
+    with ExitStack() as stack:
+        feed = stack.enter_context(service.hub.follow(grid_id))
+        first = []
+        if after is None:
+            # The number before the state: what comes between the two is told twice and not lost.
+            after = await run_in(QUICK, service.events.latest, grid_id)
+            grid = await run_in(QUICK, service.grids.grid, grid_id)
+            first = [format_sse_event(event="grid", id=str(after), data_str=grid.model_dump_json())]
+        else:
+            page = await run_in(QUICK, service.events.page, grid_id, after, 1)
+            if page.ended and not page.items:
+                return Response(status_code=204)
+        return _EventStream(_chunks(feed, after, first), stack.pop_all())
 
 
-async def _chunks(service: Context, grid_id: str, first: list[bytes], page: EventPage) -> AsyncIterator[bytes]:
+class _EventStream(StreamingResponse):
+    """A stream that leaves its place among the followers whatever becomes of the connection."""
+
+    def __init__(self, chunks: AsyncIterator[bytes], place: ExitStack) -> None:
+        super().__init__(chunks, media_type=_STREAM, headers={"Cache-Control": "no-store"})
+        self._place = place
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it to its end."""
+        with self._place:
+            await super().__call__(scope, receive, send)
+
+
+async def _chunks(feed: Feed, after: int, first: list[bytes]) -> AsyncIterator[bytes]:
     for chunk in first:
         yield chunk
     while True:
-        for item in page.items:
-            yield format_sse_event(event=item.kind, id=str(item.id), data_str=item.model_dump_json())
-        if page.ended and not page.items:
+        news = await feed.next(after, _BATCH, _KEEP_ALIVE_S)
+        if news.told:
+            after = news.told[-1].number
+            yield b"".join(told.frame for told in news.told)
+        if news.ended or feed.closed:
             return
-        if not page.items:
+        if not news.told:
             yield KEEPALIVE_COMMENT
-        page = await _await_events(service, grid_id, page.cursor, _BATCH, _KEEP_ALIVE_S)

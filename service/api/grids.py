@@ -13,6 +13,7 @@ from engine import engine_digest
 from service.api.bodies import JsonRoute
 from service.api.context import GridId, Limit, RunId, Service
 from service.api.pages import next_link
+from service.api.threads import patient
 from service.identifiers import GRID_PATTERN
 from service.requests import GridRequest, plan
 from service.schemas import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
@@ -137,6 +138,7 @@ def show_run(run_id: RunId, service: Service) -> RunDetail:
 
 
 @router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]
+@patient
 def figure(run_id: RunId, service: Service) -> Response:
     """Observation, model, normalised residual, source against truth, as PNG."""
     found = service.grids.run(run_id).result

@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Response
+import asyncio
+
+from fastapi import APIRouter, HTTPException, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from service.api.context import Service
+from service.api.context import Context, Service
+from service.api.threads import PROBES, Route, patient, run_in
 from service.schemas import Health, Readiness
+from service.store.leadership import LeaderView
 
-router = APIRouter(tags=["health"])
+router = APIRouter(tags=["health"], route_class=Route)
+_DATABASE_S = 2.0
 _TEXT = {200: {"content": {"text/plain": {"schema": {"type": "string"}}}, "description": "Prometheus text format"}}
 
 
 @router.get("/healthz")
-def healthz() -> Health:
-    """Whether this process answers."""
+async def healthz() -> Health:
+    """Whether this process answers: it waits for no thread and for no database."""
     return Health()
 
 
 @router.get("/readyz")
-def readyz(service: Service) -> Readiness:
+async def readyz(service: Service) -> Readiness:
     """Database, dispatcher and workers; ``degraded`` where nothing computes.
 
     503 where the database is away or its schema is not the one that this code was written for.
     """
-    service.database.require_schema()
-    leader = service.leadership.alive()
+    try:
+        leader = await asyncio.wait_for(run_in(PROBES, _leader, service), _DATABASE_S)
+    except TimeoutError as error:
+        detail = f"the database did not answer within {_DATABASE_S:g} s"
+        raise HTTPException(503, detail, headers={"Retry-After": "5"}) from error
     workers = 0 if leader is None else leader.workers
     return Readiness(
         status="ready" if workers else "degraded",
@@ -36,7 +44,13 @@ def readyz(service: Service) -> Readiness:
     )
 
 
+def _leader(service: Context) -> LeaderView | None:
+    service.probed.require_schema()
+    return service.leadership.alive()
+
+
 @router.get("/metrics", response_class=Response, responses=_TEXT)  # type: ignore[arg-type]
+@patient
 def metrics(service: Service) -> Response:
     """Metrics of this process and of the queue, for Prometheus."""
     return Response(service.metrics.text(), media_type=CONTENT_TYPE_LATEST)

@@ -6,6 +6,7 @@ import re
 from typing import Any, Literal
 
 from fastapi import Request
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from engine import SpecError
@@ -21,6 +22,8 @@ _NUMBERS = {
 class BodyLimit:
     """Answers 413 to a request whose body is larger than allowed, whether it says its length or not.
 
+    One whose body does not come to its announced end is dropped: half a body may well be a whole document.
+
     The body is read here, and given on whole: a limit that strikes while a handler reads would come out as whatever
     error that handler makes of it.
     """
@@ -34,7 +37,11 @@ class BodyLimit:
         if scope["type"] != "http" or scope["method"] in {"GET", "HEAD", "OPTIONS"}:
             await self.app(scope, receive, send)
             return
-        body = await self._body(scope, receive)
+        try:
+            body = await self._body(scope, receive)
+        except ClientDisconnect:
+            # What came is not what was announced: no request, and nobody to be told.
+            return
         if body is None:
             answer = problem(Request(scope), 413, f"a body may have {self.max_bytes} bytes")
             await answer(scope, receive, send)
@@ -48,10 +55,12 @@ class BodyLimit:
         body = bytearray()
         while True:
             message = await receive()
+            if message["type"] == "http.disconnect":
+                raise ClientDisconnect
             body += message.get("body", b"")
             if len(body) > self.max_bytes:
                 return None
-            if message["type"] == "http.disconnect" or not message.get("more_body", False):
+            if not message.get("more_body", False):
                 return bytes(body)
 
 
@@ -68,7 +77,7 @@ def _replay(body: bytes, receive: Receive) -> Receive:
     return replayed
 
 
-def known_parameters(request: Request) -> None:
+async def known_parameters(request: Request) -> None:
     """Refuse query parameters that the endpoint does not document, and what is given twice or is no plain number.
 
     A misspelt filter that is ignored would answer with everything, which looks like an answer. Of a header that is

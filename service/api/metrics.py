@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Iterator
 
@@ -13,45 +14,62 @@ from prometheus_client import (
     Histogram,
     ProcessCollector,
     generate_latest,
+    values,
 )
 from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.registry import Collector
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.identifiers import utc_now
+from service.process import API_NUMBER, METRICS_DIR
 from service.store.database import Database
 from service.store.depth import Depth, QueueDepth
 
 _LOG = logging.getLogger(__name__)
 _REQUEST_S = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5, 10.0, 60.0)
+_GONE = 499
+"""Counted for a client that was gone before its request or the answer was whole; nobody is ever sent it."""
 _METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 
 
 class ApiMetrics:
-    """What one API process counts, in a registry of its own."""
+    """What the API counts, in a registry of its own.
+
+    Of several API processes each keeps its metrics in files, and tells the sum over all: whoever scrapes reaches one of
+    them. Memory, CPU and descriptors are those of a process, and not told there.
+    """
 
     def __init__(self, database: Database) -> None:
+        self._files = os.environ.get(METRICS_DIR)
         self.registry = CollectorRegistry()
+        if self._files is not None:
+            # By the process's place and not by its id: a counter goes on where the one before it was killed.
+            values.ValueClass = values.MultiProcessValue(lambda: os.environ[API_NUMBER])  # type: ignore[no-untyped-call]
+        own = CollectorRegistry() if self._files is not None else self.registry
         self.requests = Counter(
             "hostlens_http_requests",
             "Requests that were answered, by the address as documented",
             ("method", "route", "status"),
-            registry=self.registry,
+            registry=own,
         )
         self.durations = Histogram(
             "hostlens_http_request_duration_seconds",
             "From the request's head to the end of the answer",
             ("method", "route"),
             buckets=_REQUEST_S,
-            registry=self.registry,
+            registry=own,
         )
-        self.under_way = Gauge("hostlens_http_requests_in_progress", "Requests under way", registry=self.registry)
-        if database.is_sqlite:
-            log = Gauge("hostlens_database_log_bytes", "Size of SQLite's write-ahead log", registry=self.registry)
-            log.set_function(database.log_bytes)
-        ProcessCollector(registry=self.registry)
-        self.registry.register(_DepthCollector(QueueDepth(database)))
+        self.under_way = Gauge(
+            "hostlens_http_requests_in_progress", "Requests under way", registry=own, multiprocess_mode="sum"
+        )
+        self.under_way.set(0)
+        if self._files is None:
+            ProcessCollector(registry=self.registry)
+        else:
+            MultiProcessCollector(self.registry, self._files)  # type: ignore[no-untyped-call]
+        self.registry.register(_DatabaseCollector(database))
 
     def text(self) -> bytes:
         """Everything, in Prometheus's text format."""
@@ -71,8 +89,7 @@ class Measured:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        # What an exception that nobody handles becomes, further out.
-        status = 500
+        status = _GONE
         began = self._clock()
 
         async def watched(message: Message) -> None:
@@ -84,6 +101,10 @@ class Measured:
         try:
             with self._metrics.under_way.track_inprogress():
                 await self.app(scope, receive, watched)
+        except Exception:
+            if status == _GONE:
+                status = 500  # what becomes of it, further out
+            raise
         finally:
             # Neither a path nor a method as it was sent: whoever asks could make as many series as he likes.
             route = getattr(scope.get("route"), "path", "none")
@@ -92,11 +113,12 @@ class Measured:
             self._metrics.durations.labels(method, route).observe(self._clock() - began)
 
 
-class _DepthCollector(Collector):
-    """The queue's depth, read at each scrape."""
+class _DatabaseCollector(Collector):
+    """The queue's depth, and the length of SQLite's log, read at each scrape."""
 
-    def __init__(self, depth: QueueDepth) -> None:
-        self._depth = depth
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._depth = QueueDepth(database)
 
     def describe(self) -> Iterator[Metric]:
         """Say nothing: to register is no reason to ask the database."""
@@ -104,6 +126,9 @@ class _DepthCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Look at the queue; without a database only that there is none."""
+        if self._database.is_sqlite:
+            text = "Size of SQLite's write-ahead log"
+            yield GaugeMetricFamily("hostlens_database_log_bytes", text, value=self._database.log_bytes())
         try:
             depth = self._depth.look()
         except SQLAlchemyError as error:

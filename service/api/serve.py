@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import signal
 
-import uvicorn
-
-from service import logs, preflight, start
+from service import logs, preflight
+from service.api import transport
 from service.api.app import create_app
-from service.process import spare_collector, stop_with_parent
+from service.process import inherited_listener, spare_collector, stop_with_parent
 from service.settings import Settings
 
 
@@ -25,12 +23,10 @@ def serve(settings: Settings) -> None:
     # At INFO uvicorn tells four things of every start; its line on each request has a logger of its own.
     logging.getLogger("uvicorn.error").setLevel(max(logging.WARNING, logging.root.level))
     stop_with_parent()
+    listener = inherited_listener()
     preflight.for_api(settings)
+    if listener is None:
+        preflight.require_free(settings.host, settings.port, preflight.API_PORT)
     app = create_app(settings)
     spare_collector()
-    config = uvicorn.Config(app, settings.host, settings.port, log_config=None, timeout_graceful_shutdown=5)
-    server = uvicorn.Server(config)
-    # Uvicorn sends itself the signals that ended it once more, for whoever handled them before: also the server.
-    for number in start.STOPS:
-        signal.signal(number, server.handle_exit)
-    server.run()
+    transport.run(app, settings, app.state.context.hub.close, listener)

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from sqlalchemy import func, select
+from sqlalchemy import Integer, String, bindparam, func, select
 
 from service.schemas import EventPage, EventView
 from service.store.database import Database
 from service.store.grids import NotFoundError
 from service.store.tables import event, grid
+
+_WANTED = bindparam("wanted", type_=String)
+_ENDED = select(grid.c.finished_at).where(grid.c.id == _WANTED)
+_EVENTS = (
+    select(event)
+    .where(event.c.grid_id == _WANTED, event.c.id > bindparam("after"))
+    .order_by(event.c.id)
+    .limit(bindparam("most", type_=Integer))
+)
+_LATEST = select(func.max(event.c.id)).where(event.c.grid_id == _WANTED)
 
 
 class EventStore:
@@ -29,12 +39,12 @@ class EventStore:
         service.store.grids.NotFoundError
             There is no such grid.
         """
-        wanted = select(event).where(event.c.grid_id == grid_id, event.c.id > after)
+        asked = {"wanted": grid_id, "after": after, "most": limit + 1}
         with self._database.read() as connection:
-            ended = connection.execute(select(grid.c.finished_at).where(grid.c.id == grid_id)).one_or_none()
+            ended = connection.execute(_ENDED, {"wanted": grid_id}).one_or_none()
             if ended is None:
                 raise NotFoundError(f"there is no grid {grid_id}")
-            rows = connection.execute(wanted.order_by(event.c.id).limit(limit + 1)).all()
+            rows = connection.execute(_EVENTS, asked).all()
         items = [EventView(**{name: getattr(row, name) for name in EventView.model_fields}) for row in rows[:limit]]
         cursor = items[-1].id if items else after
         more = len(rows) > limit
@@ -45,4 +55,4 @@ class EventStore:
     def latest(self, grid_id: str) -> int:
         """Number of the newest event of a grid, 0 where there is none."""
         with self._database.read() as connection:
-            return connection.scalar(select(func.max(event.c.id)).where(event.c.grid_id == grid_id)) or 0
+            return connection.scalar(_LATEST, {"wanted": grid_id}) or 0

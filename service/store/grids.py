@@ -10,7 +10,7 @@ from datetime import datetime
 from itertools import islice
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Row, func, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from service.identifiers import new_grid_id, run_id, utc_now
@@ -26,6 +26,16 @@ from service.store.views import RUN_COLUMNS, ended_grid_view, grid_view, run_det
 
 _T = TypeVar("_T")
 _BATCH = 5000
+# Made once: to make a statement takes as long as to carry it out.
+_GRID = select(grid).where(grid.c.id == bindparam("wanted"))
+_COUNTS = (
+    select(run.c.grid_id, run.c.state, func.count().label("runs"))
+    .where(run.c.grid_id.in_(bindparam("ids", expanding=True)))
+    .group_by(run.c.grid_id, run.c.state)
+)
+_RUN = select(run).where(run.c.id == bindparam("wanted"))
+_RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
+_ATTEMPTS = select(attempt).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
 
 
 class NotFoundError(LookupError):
@@ -164,12 +174,11 @@ class GridStore:
     def run(self, wanted: str) -> RunDetail:
         """One run with result and attempts, from one picture of the database, so that they fit each other."""
         with self._database.read() as connection:
-            row = connection.execute(select(run).where(run.c.id == wanted)).one_or_none()
+            row = connection.execute(_RUN, {"wanted": wanted}).one_or_none()
             if row is None:
                 raise NotFoundError(f"there is no run {wanted}")
-            found = connection.execute(select(result).where(result.c.run_id == wanted)).one_or_none()
-            ended = select(attempt).where(attempt.c.run_id == wanted).order_by(attempt.c.number)
-            return run_detail(row, found, connection.execute(ended).all())
+            found = connection.execute(_RESULT, {"wanted": wanted}).one_or_none()
+            return run_detail(row, found, connection.execute(_ATTEMPTS, {"wanted": wanted}).all())
 
     def cancel(self, grid_id: str) -> GridView:
         """Cancel what is queued at once and mark the grid, so that the dispatcher stops what is running.
@@ -243,7 +252,7 @@ class GridStore:
             return connection.scalar(counted) or 0
 
     def _grid(self, connection: Connection, grid_id: str) -> GridView:
-        row = connection.execute(select(grid).where(grid.c.id == grid_id)).one_or_none()
+        row = connection.execute(_GRID, {"wanted": grid_id}).one_or_none()
         if row is None:
             raise NotFoundError(f"there is no grid {grid_id}")
         return self._views(connection, [row])[0]
@@ -252,9 +261,8 @@ class GridStore:
         now = self._clock()
         # What has ended does not change, and was counted when it ended.
         ids = [row.id for row in rows if row.ending is None]
-        counted = select(run.c.grid_id, run.c.state, func.count().label("runs")).where(run.c.grid_id.in_(ids))
         counts: dict[str, dict[str, int]] = {grid_id: {} for grid_id in ids}
-        for row in connection.execute(counted.group_by(run.c.grid_id, run.c.state)) if ids else ():
+        for row in connection.execute(_COUNTS, {"ids": ids}) if ids else ():
             counts[row.grid_id][row.state] = row.runs
         return [
             grid_view(row, counts[row.id], recent(connection, row.id), now)
