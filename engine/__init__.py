@@ -20,6 +20,7 @@ from engine.errors import (
     SpecError,
 )
 from engine.grid import (
+    Expansion,
     FirstSeed,
     Grid,
     GridRun,
@@ -75,6 +76,7 @@ __all__ = [
     "ChainSummary",
     "EngineError",
     "Estimate",
+    "Expansion",
     "FirstSeed",
     "Grid",
     "GridRun",

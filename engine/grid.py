@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
 from itertools import product
+from math import prod
 from typing import Annotated
 
 from pydantic import ConfigDict, Field
@@ -94,11 +96,40 @@ def preset_names() -> tuple[str, ...]:
 
 def expand(grid: Grid) -> tuple[GridRun, ...]:
     """All runs of a grid in a fixed order; a SpecError says which value is not allowed and what is."""
-    _require_own_names(grid)
-    points = _paper_points(grid) if grid.preset is not None else _free_points(grid)
-    _require_known_parts(grid, points)
-    runs = []
-    for (system, number, host, l_eta), replicate in product(points, range(grid.replicates)):
+    return tuple(Expansion(grid))
+
+
+class Expansion:
+    """The runs of a grid in a fixed order: checked and counted at once, made one by one as they are asked for.
+
+    ``samples`` has one run of each system at each slope. What these and the values of the lists are refused for is all
+    that a run can be refused for, so neither time nor memory grows with the number of runs. A SpecError says which
+    value is not allowed and what is.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        _require_own_names(grid)
+        self._grid = grid
+        self._paper = None if grid.preset is None else _paper_points(grid)
+        samples = _samples(grid) if self._paper is None else self._paper
+        by_setting = {(_name(system), l_eta): (system, number, host, l_eta) for system, number, host, l_eta in samples}
+        _require_known_parts(grid, list(by_setting.values()))
+        self.samples = tuple(self._run(point, 0) for point in by_setting.values())
+
+    def __len__(self) -> int:
+        """How many runs there are."""
+        lists = (self._grid.systems, self._grid.n, self._grid.r_eff, self._grid.magnitude, self._grid.l_eta)
+        points = prod(len(values or ()) for values in lists) if self._paper is None else len(self._paper)
+        return points * self._grid.replicates
+
+    def __iter__(self) -> Iterator[GridRun]:
+        """Make the runs, anew each time."""
+        for point in _free_points(self._grid) if self._paper is None else self._paper:
+            for replicate in range(self._grid.replicates):
+                yield self._run(point, replicate)
+
+    def _run(self, point: _Point, replicate: int) -> GridRun:
+        (system, number, host, l_eta), grid = point, self._grid
         realization = Realization(
             system=system,
             l_eta=l_eta,
@@ -112,10 +143,7 @@ def expand(grid: Grid) -> tuple[GridRun, ...]:
         )
         name = f"{number:02d}" if number is not None else f"n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{l_eta:g}"
         suffix = f"#{replicate + 1}" if grid.replicates > 1 else ""
-        runs.append(
-            GridRun(label=f"{realization.system_name}/{name}{suffix}", paper_run=number, realization=realization)
-        )
-    return tuple(runs)
+        return GridRun(label=f"{realization.system_name}/{name}{suffix}", paper_run=number, realization=realization)
 
 
 _Point = tuple[str | LensSystem, int | None, Host, float]
@@ -190,22 +218,23 @@ def _paper_points(grid: Grid) -> list[_Point]:
     return points
 
 
-def _free_points(grid: Grid) -> list[_Point]:
+def _samples(grid: Grid) -> Iterator[_Point]:
+    """Of a free grid, the first point of each system at each slope."""
     for field in ("systems", "n", "r_eff", "magnitude", "l_eta"):
-        if not getattr(grid, field):
-            raise SpecError(field, getattr(grid, field), "a non-empty list where no preset is given")
-    systems, n, r_eff, magnitude, l_eta = grid.systems, grid.n, grid.r_eff, grid.magnitude, grid.l_eta
-    if systems is None or n is None or r_eff is None or magnitude is None or l_eta is None:
-        raise AssertionError("checked above")
-    values: dict[str, Sequence[object]] = {"n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta}
-    values["systems"] = [_name(system) for system in systems]
-    for field, entries in values.items():
+        values = getattr(grid, field)
+        if not values:
+            raise SpecError(field, values, "a non-empty list where no preset is given")
+        entries = [_name(system) for system in values] if field == "systems" else values
         if len(set(entries)) != len(entries):
             raise SpecError(field, entries, "a list without repeated values")
-    return [
-        (system, None, Host(n=index, r_eff=radius, magnitude=brightness), slope)
-        for system, slope, radius, index, brightness in product(systems, l_eta, r_eff, n, magnitude)
-    ]
+    first = {name: getattr(grid, name)[:1] for name in ("n", "r_eff", "magnitude")}
+    return _free_points(dataclasses.replace(grid, **first))
+
+
+def _free_points(grid: Grid) -> Iterator[_Point]:
+    axes = (grid.systems or (), grid.l_eta or (), grid.r_eff or (), grid.n or (), grid.magnitude or ())
+    for system, slope, radius, index, brightness in product(*axes):
+        yield system, None, Host(n=index, r_eff=radius, magnitude=brightness), slope
 
 
 def _name(system: str | LensSystem) -> str:

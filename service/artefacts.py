@@ -11,7 +11,7 @@ import fsspec
 
 from service.payload import ArtefactPayload
 
-_KEY = re.compile(r"^[0-9a-f]{2}/[0-9a-f]{64}\.[a-z0-9]{1,8}$")
+KEY = re.compile(r"^[0-9a-f]{2}/[0-9a-f]{64}\.[a-z0-9]{1,8}$")
 
 
 class ArtefactStore:
@@ -23,15 +23,17 @@ class ArtefactStore:
         self._files, self._root = fsspec.core.url_to_fs(url, **options)
 
     def put(self, data: bytes, suffix: str) -> ArtefactPayload:
-        """Write ``data`` unless it is there; OSError where the store does not take it."""
+        """Write ``data``, also where it is there already; OSError where the store does not take it.
+
+        What lies there may be damaged, or so old that somebody takes it for an orphan: see :mod:`service.orphans`.
+        """
         digest = hashlib.sha256(data).hexdigest()
         key = f"{digest[:2]}/{digest}.{suffix}"
         path = self.path(key)
-        if not self._files.exists(path):
-            # Written beside its place and moved: a reader, or a second worker, never sees half a file.
-            partial = f"{path}.{uuid4().hex}.partial"
-            self._files.pipe_file(partial, data)
-            self._files.mv(partial, path)
+        # Written beside its place and moved: a reader, or a second worker, never sees half a file.
+        partial = f"{path}.{uuid4().hex}.partial"
+        self._files.pipe_file(partial, data)
+        self._files.mv(partial, path)
         return ArtefactPayload(key=key, digest=digest)
 
     def read(self, key: str) -> bytes:
@@ -43,7 +45,7 @@ class ArtefactStore:
 
     def path(self, key: str) -> str:
         """Full path of ``key``; ValueError where it is not a key, since it could point outside the store."""
-        if not _KEY.match(key):
+        if not KEY.match(key):
             raise ValueError(f"not an artefact key: {key!r}")
         return f"{self._root}/{key}"
 

@@ -363,6 +363,26 @@ def _database_settings() -> Settings:
     return settings
 
 
+@database.command("prune")
+def db_prune(
+    older_than: Annotated[str, typer.Option("--older-than", metavar="AGE", help="As 90d, 12h or 4w")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would go, and delete nothing")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask")] = False,
+) -> None:
+    """Delete old events, attempts and keys of grids that have ended, and files that no result refers to.
+
+    First it shows what would go, and what stays and why. The service may run meanwhile.
+    """
+    from service import pruning  # noqa: PLC0415 - loads fsspec
+
+    try:
+        age = pruning.read_age(older_than)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--older-than") from error
+    with _migrating():
+        raise typer.Exit(pruning.prune(_database_settings(), age, _console(), dry_run=dry_run, ask=not yes))
+
+
 @contextmanager
 def _migrating() -> Iterator[None]:
     """Where a refusal of the database or of a migration ends the command with a line instead of a traceback."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, StringConstraints, create_model
@@ -15,6 +16,7 @@ from engine import (
     PRINTABLE,
     Analysis,
     CameraChoice,
+    Expansion,
     FirstSeed,
     Grid,
     GridRun,
@@ -35,7 +37,6 @@ from engine import (
     check_realization,
     check_system,
     engine_digest,
-    expand,
     load_camera,
     load_system,
     preset_names,
@@ -44,7 +45,7 @@ from engine import (
     system_names,
 )
 from service.schemas import CameraItem, EngineView, SystemItem, SystemView
-from service.store.grids import PlannedRun
+from service.store.submission import PlannedRun
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -102,8 +103,23 @@ class TooManyRunsError(ValueError):
         super().__init__(f"the grid has {runs} runs, allowed are {allowed}")
 
 
-def plan(request: GridRequest, max_runs: int) -> list[PlannedRun]:
-    """The runs that a request means, in the engine's order.
+class Plan:
+    """The runs that a request means, in the engine's order: counted at once, made one by one as they are stored."""
+
+    def __init__(self, runs: Expansion) -> None:
+        self._runs = runs
+
+    def __len__(self) -> int:
+        """How many runs there are."""
+        return len(self._runs)
+
+    def __iter__(self) -> Iterator[PlannedRun]:
+        """Make the runs, anew each time."""
+        return map(_planned, self._runs)
+
+
+def plan(request: GridRequest, max_runs: int) -> Plan:
+    """What a request means; whatever is to be refused is refused here, before any run is made.
 
     Raises
     ------
@@ -112,17 +128,16 @@ def plan(request: GridRequest, max_runs: int) -> list[PlannedRun]:
     TooManyRunsError
         There would be more than ``max_runs``.
     """
-    # Counted with one replicate and before anything is expanded: a few lists can mean more runs than there is memory.
+    # Before anything is looked at: a few lists can mean more systems and slopes than there is time for.
     lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
     if request.preset is None:
         _limit(math.prod(len(values or ()) for values in lists) * request.replicates, max_runs)
     _check_own_systems(request)
-    single = expand(_grid(request, replicates=1))
-    _limit(len(single) * request.replicates, max_runs)
-    for run in single:
+    runs = Expansion(_grid(request))
+    _limit(len(runs), max_runs)
+    for run in runs.samples:
         _check(request, run.realization)
-    runs = single if request.replicates == 1 else expand(_grid(request, request.replicates))
-    return [_planned(run) for run in runs]
+    return Plan(runs)
 
 
 def _check_own_systems(request: GridRequest) -> None:
@@ -160,7 +175,7 @@ def _limit(runs: int, allowed: int) -> None:
         raise TooManyRunsError(runs, allowed)
 
 
-def _grid(request: GridRequest, replicates: int) -> Grid:
+def _grid(request: GridRequest) -> Grid:
     cuts: dict[str, Any] = {
         name: None if getattr(request, name) is None else tuple(getattr(request, name))
         for name in ("systems", "n", "r_eff", "magnitude", "l_eta")
@@ -173,7 +188,7 @@ def _grid(request: GridRequest, replicates: int) -> Grid:
         optics=request.optics,
         camera=request.camera,
         seed=request.seed,
-        replicates=replicates,
+        replicates=request.replicates,
         analysis=Analysis(**changes),
         **cuts,
     )

@@ -48,8 +48,8 @@ async def list_events(
 
     With ``wait`` an answer without events is held back until there is one or the grid has ended. With ``Accept:
     text/event-stream`` a stream: first an event ``grid`` with the whole state (unless Last-Event-ID resumes an earlier
-    stream), then each event under its kind, to the end of the grid. As many streams and long polls may wait as a
-    setting says; others are answered 429.
+    stream, nothing of which has been pruned since), then each event under its kind, to the end of the grid. As many
+    streams and long polls may wait as a setting says; others are answered 429.
     """
     try:
         if _STREAM in request.headers.get("accept", ""):
@@ -76,7 +76,8 @@ async def _stream(service: Context, grid_id: str, after: int | None) -> Response
     with ExitStack() as stack:
         feed = stack.enter_context(service.hub.follow(grid_id))
         first = []
-        if after is None:
+        # What came after the last event that was seen may have been pruned: then the whole state, as to a newcomer.
+        if after is None or await run_in(QUICK, service.events.lacks, grid_id, after):
             # The number before the state: what comes between the two is told twice and not lost.
             after = await run_in(QUICK, service.events.latest, grid_id)
             grid = await run_in(QUICK, service.grids.grid, grid_id)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from itertools import islice
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Request, Response
@@ -42,8 +43,9 @@ def submit(
 ) -> JSONResponse:
     """Accept a grid: once this answers 202 its runs are in the database. ``dry_run`` only checks."""
     if dry_run:
-        labels = [run.label for run in plan(body, service.settings.max_grid_runs)]
-        return JSONResponse(DryRun(n_runs=len(labels), labels=labels[:_SHOWN_LABELS]).model_dump(mode="json"))
+        runs = plan(body, service.settings.max_grid_runs)
+        labels = [run.label for run in islice(runs, _SHOWN_LABELS)]
+        return JSONResponse(DryRun(n_runs=len(runs), labels=labels).model_dump(mode="json"))
     made = service.grids.create(
         body.canonical(),
         lambda: plan(body, service.settings.max_grid_runs),

@@ -22,6 +22,7 @@ from service.schemas import Place, Problem
 from service.store.database import AWAY
 from service.store.faults import AccessRefusedError, SchemaMismatchError, StatementTooLongError
 from service.store.grids import KeyReusedError, NotFoundError
+from service.store.submission import SubmissionLostError
 
 MEDIA_TYPE = "application/problem+json"
 _LOG = logging.getLogger(__name__)
@@ -81,6 +82,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(TooManyRunsError, _too_many)
     app.add_exception_handler(NotFoundError, _not_found)
     app.add_exception_handler(KeyReusedError, _key_reused)
+    app.add_exception_handler(SubmissionLostError, _lost)
     app.add_exception_handler(HTTPException, _http)
     app.add_exception_handler(DBAPIError, _database)
     app.add_exception_handler(PoolTimeoutError, _database)
@@ -153,6 +155,10 @@ def _key_reused(request: Request, _: Exception) -> Response:
     message = "this Idempotency-Key was used for another request"
     place = Place.model_validate({"in": "header", "pointer": "idempotency-key", "message": message})
     return problem(request, 422, message, [place])
+
+
+def _lost(request: Request, error: Exception) -> Response:
+    return problem(request, 503, str(error), headers={"Retry-After": "1"})
 
 
 def _http(request: Request, error: Exception) -> Response:

@@ -161,6 +161,8 @@ class Dispatcher:
             self._hold_paused()
         if self._is_due("reconcile", self._settings.reconcile_s):
             self._reconcile()
+        if self._is_due("upkeep", self._settings.reconcile_s) and self._queue.upkeep.step():
+            self._due["upkeep"] = 0.0  # there may be more, which waits for the next step and not for longer
 
     def _land_and_write(self) -> None:
         self._collect(0.1)

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
 
-from sqlalchemy import case, func, select, text
+from sqlalchemy import case, false, func, select, text
 
 from service.identifiers import utc_now
 from service.store.database import Database
 from service.store.leadership import LeaderView, leader_view
+from service.store.settling import held_grids
 from service.store.states import GridState, RunState
 from service.store.tables import grid, run
 
@@ -48,9 +49,11 @@ class QueueDepth:
         # By their token, which every leased run has: counted as rows SQLite would go through all that ever ran.
         leased = select(func.count(run.c.token)).where(text(f"state = '{RunState.LEASED}'"))
         with self._database.read() as connection:
-            runs, delayed, first = connection.execute(queued.where(text(f"state = '{RunState.QUEUED}'"))).one()
+            waits = (text(f"state = '{RunState.QUEUED}'"), run.c.grid_id.not_in(held_grids()))
+            runs, delayed, first = connection.execute(queued.where(*waits)).one()
             busy = connection.scalar(leased) or 0
-            counted = connection.execute(select(grid.c.state, func.count()).group_by(grid.c.state))
+            whole = select(grid.c.state, func.count()).where(grid.c.storing == false())
+            counted = connection.execute(whole.group_by(grid.c.state))
             grids = {str(state): number for state, number in counted}
             leading = leader_view(connection)
         return Depth(

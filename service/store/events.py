@@ -6,11 +6,11 @@ from sqlalchemy import Integer, String, bindparam, func, select
 
 from service.schemas import EventPage, EventView
 from service.store.database import Database
-from service.store.grids import NotFoundError
+from service.store.grids import WHOLE, NotFoundError
 from service.store.tables import event, grid
 
 _WANTED = bindparam("wanted", type_=String)
-_ENDED = select(grid.c.finished_at).where(grid.c.id == _WANTED)
+_ENDED = select(grid.c.finished_at).where(grid.c.id == _WANTED, WHOLE)
 _EVENTS = (
     select(event)
     .where(event.c.grid_id == _WANTED, event.c.id > bindparam("after"))
@@ -56,3 +56,13 @@ class EventStore:
         """Number of the newest event of a grid, 0 where there is none."""
         with self._database.read() as connection:
             return connection.scalar(_LATEST, {"wanted": grid_id}) or 0
+
+    def lacks(self, grid_id: str, after: int) -> bool:
+        """Whether events above ``after`` have been pruned, so that whoever saw ``after`` last cannot read on from it.
+
+        The first event of a grid tells of its submission, unless it was pruned.
+        """
+        first = select(event.c.id, event.c.kind).where(event.c.grid_id == grid_id).order_by(event.c.id).limit(1)
+        with self._database.read() as connection:
+            oldest = connection.execute(first).one_or_none()
+        return oldest is not None and oldest.kind != "grid_submitted" and oldest.id > after

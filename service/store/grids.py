@@ -4,36 +4,38 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import islice
-from typing import Any, TypeVar
+from typing import Any
 
-from sqlalchemy import Connection, Row, bindparam, func, insert, select, update
+from sqlalchemy import Connection, Row, bindparam, false, func, select, update
 from sqlalchemy.exc import IntegrityError
 
-from service.identifiers import new_grid_id, run_id, utc_now
+from service.identifiers import utc_now
 from service.schemas import GridPage, GridView, RunDetail, RunPage
-from service.store.bulk import insert_rows
 from service.store.database import Database
-from service.store.leases import add_event, close_grids, lock_grids, pause_queued
+from service.store.leases import add_event, lock_grids
 from service.store.pace import recent
-from service.store.states import CANCEL, RESUME, REVIVE, GridState, RunState, move
+from service.store.pieces import Turns
+from service.store.settling import IS_OPEN, settle
+from service.store.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
+from service.store.submission import Plan, Submission, give_up, store
 from service.store.summary import summarise
 from service.store.tables import attempt, event, grid, idempotency, result, run
 from service.store.views import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
 
-_T = TypeVar("_T")
-_BATCH = 5000
+WHOLE = grid.c.storing == false()
+"""What anybody may see: all but what is being stored."""
+_BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
 # Made once: to make a statement takes as long as to carry it out.
-_GRID = select(grid).where(grid.c.id == bindparam("wanted"))
+_GRID = select(grid).where(grid.c.id == bindparam("wanted"), WHOLE)
 _COUNTS = (
     select(run.c.grid_id, run.c.state, func.count().label("runs"))
     .where(run.c.grid_id.in_(bindparam("ids", expanding=True)))
     .group_by(run.c.grid_id, run.c.state)
 )
-_RUN = select(run).where(run.c.id == bindparam("wanted"))
+_RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
 _RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
 _ATTEMPTS = select(attempt).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
 
@@ -44,17 +46,6 @@ class NotFoundError(LookupError):
 
 class KeyReusedError(ValueError):
     """An idempotency key came back with another request."""
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run of a grid that is about to be stored."""
-
-    label: str
-    paper_run: int | None
-    spec: dict[str, Any]
-    inputs: dict[str, Any]
-    digest: str
 
 
 @dataclass(frozen=True)
@@ -75,70 +66,56 @@ class GridStore:
     def create(
         self,
         request: dict[str, Any],
-        plan: Callable[[], Sequence[PlannedRun]],
+        plan: Callable[[], Plan],
         name: str | None = None,
         key: str | None = None,
         engine: str | None = None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
-        Grid, runs and key are one transaction: after a crash there is the whole grid or none of it. ``plan`` is
-        called only where there is something to create. ``engine`` is the digest of the engine whose results the grid
-        takes, any where None.
+        After a crash there is the whole grid or none of it: what has been stored in part nobody sees, and it is gone on
+        with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
+        ``engine`` is the digest of the engine whose results the grid takes, any where None.
 
         Raises
         ------
         KeyReusedError
             The key belongs to another request.
+        SubmissionLostError
+            Storing took so long that the grid was given up.
         """
         canonical = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
         known = self._by_key(key, canonical)
-        if known is not None:
-            return Created(known, replayed=True)
+        if known is not None and not known.storing:
+            return Created(self.grid(known.id), replayed=True)
         runs = plan()
-        try:
-            return Created(self._insert(request, runs, name, key, canonical, engine), replayed=False)
-        except IntegrityError:
-            # Someone came first with the same key, between our look and our insert.
-            known = self._by_key(key, canonical)
-            if known is None:
-                raise
-            return Created(known, replayed=True)
+        if known is not None and known.engine_digest != engine:
+            # Another engine may have meant other runs by the same request.
+            with self._database.write() as connection:
+                give_up(connection, known.id, self._clock())
+            known = None
+        new = Submission(request, canonical, name, key, engine, self._clock())
+        if known is None:
+            try:
+                return Created(self.grid(store(self._database, new, runs)), replayed=False)
+            except IntegrityError:
+                # Someone came first with the same key, between our look and our insert.
+                known = self._by_key(key, canonical)
+                if known is None:
+                    raise
+        begun = replace(new, created_at=known.created_at)
+        return Created(self.grid(store(self._database, begun, runs, known.id)), replayed=True)
 
-    def _insert(
-        self,
-        request: dict[str, Any],
-        runs: Sequence[PlannedRun],
-        name: str | None,
-        key: str | None,
-        canonical: str,
-        engine: str | None,
-    ) -> GridView:
-        now = self._clock()
-        grid_id = new_grid_id(now)
-        with self._database.write() as connection:
-            row = {"id": grid_id, "name": name, "request": request, "n_runs": len(runs), "created_at": now}
-            connection.execute(insert(grid).values(state=GridState.QUEUED, engine_digest=engine, **row))
-            if key is not None:
-                made = {"key": key, "request_digest": canonical, "grid_id": grid_id, "created_at": now}
-                connection.execute(insert(idempotency), made)
-            for batch in _batches(enumerate(runs), _BATCH):
-                rows = [_run_row(grid_id, ordinal, planned, now) for ordinal, planned in batch]
-                insert_rows(connection, run, rows)
-            add_event(connection, grid_id, "grid_submitted", now, n_runs=len(runs))
-            return self._grid(connection, grid_id)
-
-    def _by_key(self, key: str | None, canonical: str) -> GridView | None:
+    def _by_key(self, key: str | None, canonical: str) -> Row[*tuple[Any, ...]] | None:
+        """Row of the grid that a key made, whole or not."""
         if key is None:
             return None
         with self._database.read() as connection:
-            wanted = select(idempotency.c.grid_id, idempotency.c.request_digest).where(idempotency.c.key == key)
-            row = connection.execute(wanted).one_or_none()
-            if row is None:
-                return None
-            if row.request_digest != canonical:
-                raise KeyReusedError(key)
-            return self._grid(connection, row.grid_id)
+            found = select(idempotency.c.request_digest, *_BEGUN).join(grid, grid.c.id == idempotency.c.grid_id)
+            row = connection.execute(found.where(idempotency.c.key == key)).one_or_none()
+        if row is not None and row.request_digest != canonical:
+            raise KeyReusedError(key)
+        return row
 
     def grid(self, grid_id: str) -> GridView:
         """One grid; a NotFoundError where there is none."""
@@ -152,7 +129,7 @@ class GridStore:
 
     def grids(self, limit: int, before: str | None = None) -> GridPage:
         """A page of grids, newest first, all from one picture of the database; ``next`` holds the cursor."""
-        wanted = select(grid).order_by(grid.c.id.desc()).limit(limit + 1)
+        wanted = select(grid).where(WHOLE).order_by(grid.c.id.desc()).limit(limit + 1)
         if before is not None:
             wanted = wanted.where(grid.c.id < before)
         with self._database.read() as connection:
@@ -181,21 +158,20 @@ class GridStore:
             return run_detail(row, found, connection.execute(_ATTEMPTS, {"wanted": wanted}).all())
 
     def cancel(self, grid_id: str) -> GridView:
-        """Cancel what is queued at once and mark the grid, so that the dispatcher stops what is running.
+        """Mark the grid, so that nothing of it is started and the dispatcher stops what is running; end what is queued.
 
         A grid that has ended stays as it is.
         """
         now = self._clock()
-        with self._database.write() as connection:
-            self._require(connection, grid_id)
-            lock_grids(connection, [grid_id])
-            open_grid = (grid.c.id == grid_id) & (grid.c.state == GridState.QUEUED) & grid.c.cancelled_at.is_(None)
-            marked = connection.execute(update(grid).where(open_grid).values(cancelled_at=now, paused_at=None))
-            if marked.rowcount:
-                dropped = move(connection, CANCEL, run.c.grid_id == grid_id, finished_at=now)
-                add_event(connection, grid_id, "grid_cancelled", now, queued=len(dropped))
-                close_grids(connection, [grid_id], now)
-            return self._grid(connection, grid_id)
+
+        def mark(connection: Connection) -> None:
+            open_grid = (grid.c.id == grid_id) & IS_OPEN & grid.c.cancelled_at.is_(None)
+            values = {"cancelled_at": now, "paused_at": None, "revive_from": None}
+            if connection.execute(update(grid).where(open_grid).values(**values)).rowcount:
+                queued = _count(connection, grid_id, CANCEL.sources)
+                add_event(connection, grid_id, "grid_cancelled", now, queued=queued)
+
+        return self._marked(grid_id, mark)
 
     def pause(self, grid_id: str) -> GridView:
         """Take the queued runs of a grid out of the queue; what is running goes on to its end.
@@ -203,27 +179,24 @@ class GridStore:
         A grid that has ended, is being cancelled or is paused already stays as it is.
         """
         now = self._clock()
-        with self._database.write() as connection:
-            self._require(connection, grid_id)
-            lock_grids(connection, [grid_id])
-            open_grid = (grid.c.id == grid_id) & (grid.c.state == GridState.QUEUED) & grid.c.cancelled_at.is_(None)
-            marked = connection.execute(update(grid).where(open_grid, grid.c.paused_at.is_(None)).values(paused_at=now))
-            if marked.rowcount:
-                held = pause_queued(connection, run.c.grid_id == grid_id)
-                add_event(connection, grid_id, "grid_paused", now, runs=len(held))
-            return self._grid(connection, grid_id)
+
+        def mark(connection: Connection) -> None:
+            open_grid = (grid.c.id == grid_id) & IS_OPEN & grid.c.cancelled_at.is_(None) & grid.c.paused_at.is_(None)
+            if connection.execute(update(grid).where(open_grid).values(paused_at=now)).rowcount:
+                add_event(connection, grid_id, "grid_paused", now, runs=_count(connection, grid_id, PAUSE.sources))
+
+        return self._marked(grid_id, mark)
 
     def resume(self, grid_id: str) -> GridView:
         """Put the paused runs of a grid back to their places in the queue; one that is not paused stays as it is."""
         now = self._clock()
-        with self._database.write() as connection:
-            self._require(connection, grid_id)
-            lock_grids(connection, [grid_id])
+
+        def mark(connection: Connection) -> None:
             paused = (grid.c.id == grid_id) & grid.c.paused_at.is_not(None)
             if connection.execute(update(grid).where(paused).values(paused_at=None)).rowcount:
-                freed = move(connection, RESUME, run.c.grid_id == grid_id)
-                add_event(connection, grid_id, "grid_resumed", now, runs=len(freed))
-            return self._grid(connection, grid_id)
+                add_event(connection, grid_id, "grid_resumed", now, runs=_count(connection, grid_id, RESUME.sources))
+
+        return self._marked(grid_id, mark)
 
     def revive(self, grid_id: str) -> int:
         """Queue again every run of a grid that ended without a result; how many.
@@ -232,18 +205,37 @@ class GridStore:
         others.
         """
         now = self._clock()
+        runs = 0
+
+        def mark(connection: Connection) -> None:
+            nonlocal runs
+            runs = _count(connection, grid_id, REVIVE.sources)
+            if runs:
+                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
+                connection.execute(update(grid).where(grid.c.id == grid_id).values(revive_from=0, **values))
+                add_event(connection, grid_id, "grid_revived", now, runs=runs)
+
+        self._marked(grid_id, mark)
+        return runs
+
+    def _marked(self, grid_id: str, mark: Callable[[Connection], None]) -> GridView:
+        """Set a mark and bring the runs to where it wants them, the first of them in the same transaction.
+
+        Should this process die in between, the dispatcher goes on, and so does whoever asks for the same again.
+        """
+        turns = Turns(self._database)
         with self._database.write() as connection:
             self._require(connection, grid_id)
             lock_grids(connection, [grid_id])
-            fresh = {"not_before": now, "charged_from": run.c.attempt, "finished_at": None, "suspect": False}
-            mine = run.c.grid_id == grid_id
-            moved = move(connection, REVIVE, mine, error_code=None, error_detail=None, **fresh)
-            if moved:
-                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
-                connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))
-                add_event(connection, grid_id, "grid_revived", now, runs=len(moved))
-                pause_queued(connection, mine)
-            return len(moved)
+            mark(connection)
+            more = settle(connection, grid_id, self._clock())
+        while more:
+            turns.ended()
+            turns.wait()
+            with self._database.write() as connection:
+                lock_grids(connection, [grid_id])
+                more = settle(connection, grid_id, self._clock())
+        return self.grid(grid_id)
 
     def stale_results(self) -> int:
         """How many results came too late so far, over all grids."""
@@ -264,36 +256,18 @@ class GridStore:
         counts: dict[str, dict[str, int]] = {grid_id: {} for grid_id in ids}
         for row in connection.execute(_COUNTS, {"ids": ids}) if ids else ():
             counts[row.grid_id][row.state] = row.runs
+        latest = recent(connection, ids) if ids else {}
         return [
-            grid_view(row, counts[row.id], recent(connection, row.id), now)
-            if row.ending is None
-            else ended_grid_view(row)
+            grid_view(row, counts[row.id], latest.get(row.id), now) if row.ending is None else ended_grid_view(row)
             for row in rows
         ]
 
     @staticmethod
     def _require(connection: Connection, grid_id: str) -> None:
-        if connection.scalar(select(grid.c.id).where(grid.c.id == grid_id)) is None:
+        if connection.scalar(select(grid.c.id).where(grid.c.id == grid_id, WHOLE)) is None:
             raise NotFoundError(f"there is no grid {grid_id}")
 
 
-def _run_row(grid_id: str, ordinal: int, planned: PlannedRun, now: datetime) -> dict[str, Any]:
-    return {
-        "id": run_id(grid_id, ordinal),
-        "grid_id": grid_id,
-        "ordinal": ordinal,
-        "label": planned.label,
-        "paper_run": planned.paper_run,
-        "spec": planned.spec,
-        "inputs": planned.inputs,
-        "digest": planned.digest,
-        "state": RunState.QUEUED,
-        "attempt": 0,
-        "charged_from": 0,
-        "not_before": now,
-    }
-
-
-def _batches(items: Iterator[_T], size: int) -> Iterator[list[_T]]:
-    while batch := list(islice(items, size)):
-        yield batch
+def _count(connection: Connection, grid_id: str, states: Collection[RunState]) -> int:
+    counted = select(func.count()).where(run.c.grid_id == grid_id, run.c.state.in_(sorted(states)))
+    return connection.scalar(counted) or 0

@@ -11,7 +11,7 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, func, select, update
+from sqlalchemy import ColumnElement, Connection, Row, exists, func, literal_column, select, update
 
 from service.store.bulk import insert_rows
 from service.store.pace import recent
@@ -90,8 +90,9 @@ def lock_grids(connection: Connection, grid_ids: Iterable[str]) -> None:
 
 def leased(connection: Connection, where: ColumnElement[bool]) -> Sequence[Row[*tuple[Any, ...]]]:
     """The leased runs that ``where`` picks, they and their grids locked to the end of the transaction."""
-    condition = (run.c.state == RunState.LEASED) & where
-    lock_grids(connection, connection.scalars(select(run.c.grid_id).where(condition).distinct()))
+    # Spelt out, and the grids not made distinct there, or a take-over would go through all runs that ever were.
+    condition = (run.c.state == literal_column(f"'{RunState.LEASED}'")) & where
+    lock_grids(connection, connection.scalars(select(run.c.grid_id).where(condition)))
     return list(connection.execute(select(*_LEASED).where(condition).order_by(run.c.id).with_for_update()).all())
 
 
@@ -183,11 +184,13 @@ def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) 
     """Store the final state of each grid whose last run has just ended; the caller holds the grids' locks."""
     for grid_id in sorted(set(grid_ids)):
         mine = run.c.grid_id == grid_id
-        if connection.scalar(select(exists().where(mine, run.c.state.in_(sorted(OPEN_STATES))))):
+        is_open = exists().where(mine, run.c.state.in_(sorted(OPEN_STATES)))
+        being_retried = exists().where(grid.c.id == grid_id, grid.c.revive_from.is_not(None))
+        if connection.scalar(select(is_open | being_retried)):
             continue
         counted = select(run.c.state, func.count().label("runs")).where(mine).group_by(run.c.state)
         runs = {row.state: row.runs for row in connection.execute(counted)}
-        state, latest = final_state(runs), recent(connection, grid_id)
+        state, latest = final_state(runs), recent(connection, [grid_id]).get(grid_id)
         ending = {"counts": runs, "rate_per_s": latest and latest.rate()}
         values = {"state": state, "finished_at": now, "paused_at": None, "ending": ending}
         connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))

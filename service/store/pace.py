@@ -1,13 +1,14 @@
-"""How fast a grid's runs end: measured on the latest of them."""
+"""How fast grids' runs end: measured on the latest of them."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
 
 from sqlalchemy import Connection, bindparam, func, select
 
-from service.store.tables import run
+from service.store.tables import grid, run
 
 _RUNS = 100
 
@@ -27,16 +28,20 @@ class Recent:
 
 _LATEST = (
     select(run.c.finished_at, run.c.leased_at)
-    .where(run.c.grid_id == bindparam("wanted"), run.c.finished_at.is_not(None), run.c.leased_at.is_not(None))
+    .where(run.c.grid_id == grid.c.id, run.c.finished_at.is_not(None), run.c.leased_at.is_not(None))
     .order_by(run.c.finished_at.desc())
     .limit(_RUNS)
+    .correlate(grid)
     .subquery()
 )
+_MEASURES = (func.count(), func.min(_LATEST.c.leased_at), func.max(_LATEST.c.finished_at))
 # Made once: to make it takes longer than to carry it out.
-_MEASURED = select(func.count(), func.min(_LATEST.c.leased_at), func.max(_LATEST.c.finished_at))
+_MEASURED = select(grid.c.id, *(select(measure).select_from(_LATEST).scalar_subquery() for measure in _MEASURES)).where(
+    grid.c.id.in_(bindparam("ids", expanding=True))
+)
 
 
-def recent(connection: Connection, grid_id: str) -> Recent | None:
-    """The latest runs of a grid, None where none has ended."""
-    runs, began_at, ended_at = connection.execute(_MEASURED, {"wanted": grid_id}).one()
-    return None if not runs else Recent(runs, began_at, ended_at)
+def recent(connection: Connection, grid_ids: Collection[str]) -> dict[str, Recent]:
+    """The latest runs of each grid of which any has ended."""
+    rows = connection.execute(_MEASURED, {"ids": sorted(grid_ids)})
+    return {grid_id: Recent(runs, began_at, ended_at) for grid_id, runs, began_at, ended_at in rows if runs}

@@ -31,9 +31,11 @@ from service.store.leases import (
     requeue,
 )
 from service.store.results import result_row
-from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move, moving
+from service.store.settling import held_grids
+from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, RunState, move, moving
 from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
+from service.store.upkeep import Upkeep
 
 _MAX_DELAY_S = 600.0
 _JITTER = (0.5, 1.5)
@@ -81,6 +83,7 @@ class RunQueue:
         self._database = database
         self._clock = clock
         self._retry_delay_s = retry_delay_s
+        self.upkeep = Upkeep(database, clock)
 
     def waiting(self, engine: str | None = None, *, suspects: bool = False) -> bool:
         """Whether a claim would find a run; asked first, because a look needs no lock and an idle queue is the rule."""
@@ -260,7 +263,8 @@ class RunQueue:
         longest = timedelta(seconds=_MAX_DELAY_S * _JITTER[1])
         wrong = (run.c.state == literal_column(f"'{RunState.QUEUED}'")) & (run.c.not_before > now + _SLACK)
         wrong &= (run.c.attempt == run.c.charged_from) | (run.c.not_before > now + longest)
-        grids = select(run.c.grid_id).where(wrong).distinct()
+        # Not made distinct there, or a database may go through all runs in the order of their grids.
+        grids = select(run.c.grid_id).where(wrong)
         with self._database.read() as connection:
             if connection.scalar(grids.limit(1)) is None:
                 return 0
@@ -338,11 +342,8 @@ def _ready(now: datetime, engine: str | None, suspects: bool) -> ColumnElement[b
     """
     queued = run.c.state == literal_column(f"'{RunState.QUEUED}'")
     ready = queued & (run.c.suspect == (true() if suspects else false())) & (run.c.not_before <= now)
-    if engine is None:
-        return ready
-    is_open = grid.c.state == literal_column(f"'{GridState.QUEUED}'")
-    others = select(grid.c.id).where(is_open, grid.c.engine_digest != engine)
-    return ready & run.c.grid_id.not_in(others)
+    others = None if engine is None else grid.c.engine_digest != engine
+    return ready & run.c.grid_id.not_in(held_grids(others))
 
 
 def _held_by_any(leases: Sequence[Lease]) -> ColumnElement[bool]:

@@ -30,7 +30,7 @@ from sqlalchemy.types import TypeEngine
 
 from service.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
 
-REVISION = "0005"
+REVISION = "0006"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -83,14 +83,24 @@ grid = Table(
     Column("paused_at", UtcDateTime),
     # Whose results are taken; null in grids that are older than this column, which take any engine's.
     Column("engine_digest", String(64)),
+    # Its runs are still being stored: nobody sees it, and nothing of it is claimed.
+    Column("storing", Boolean, nullable=False, server_default=false()),
+    # In a retry, the first place that has not been looked at; null where there is none under way.
+    Column("revive_from", Integer),
     # What would otherwise be counted anew with every look; null as long as a run is open.
     Column("ending", JSON(none_as_null=True)),
     CheckConstraint("state in ('queued', 'done', 'failed', 'cancelled')", name="state"),
+    # How many there are of each, without reading requests of up to a megabyte.
+    Index("ix_grid_state_storing", "state", "storing"),
 )
-# The grids that are not finished: few, however many have ended.
+# The grids that are not finished: few, however many have ended. All that a claim asks of them is here.
 Index(
     "ix_grid_open",
+    grid.c.id,
     grid.c.engine_digest,
+    grid.c.storing,
+    grid.c.cancelled_at,
+    grid.c.paused_at,
     sqlite_where=text("state = 'queued'"),
     postgresql_where=text("state = 'queued'"),
 )
@@ -127,19 +137,24 @@ run = Table(
     # A lease is a state with a token, never the one without the other.
     CheckConstraint("(state = 'leased') = (token is not null)", name="lease_has_token"),
     Index("ix_run_grid_id_state_ordinal", "grid_id", "state", "ordinal"),
+    # For the rate: those that ended after they had been worked on, however many were cancelled before.
     Index(
-        "ix_run_grid_id_finished_at",
+        "ix_run_grid_id_finished_at_leased_at",
         "grid_id",
         "finished_at",
-        sqlite_where=text("finished_at is not null"),
-        postgresql_where=text("finished_at is not null"),
+        "leased_at",
+        sqlite_where=text("finished_at is not null and leased_at is not null"),
+        postgresql_where=text("finished_at is not null and leased_at is not null"),
     ),
 )
-# What a claim reads: the queue in its order, however many finished runs lie beside it.
+# What a claim reads: the queue in its order, however many finished runs lie beside it. With all that it asks of a run,
+# so that it gets quickly past the many of a grid that is being stored, cancelled or paused just now.
 Index(
     "ix_run_queue",
     run.c.not_before,
     run.c.id,
+    run.c.grid_id,
+    run.c.suspect,
     sqlite_where=text("state = 'queued'"),
     postgresql_where=text("state = 'queued'"),
 )
@@ -151,8 +166,11 @@ Index(
     sqlite_where=text("state = 'queued' and suspect = 1"),
     postgresql_where=text("state = 'queued' and suspect"),
 )
+# In the order in which they are locked, or a take-over would go through all runs for the sake of that order.
 Index(
     "ix_run_leased",
+    run.c.id,
+    run.c.generation,
     run.c.token,
     sqlite_where=text("state = 'leased'"),
     postgresql_where=text("state = 'leased'"),

@@ -134,8 +134,11 @@ OPERATIONS = {
 }
 
 
-def die_at(url: str, name: str, scene: Scene, boundary: int) -> None:
-    """Carry out an operation in this process, and die without a word at its ``boundary``-th boundary."""
+def die_at(url: str, name: str, scene: Scene, boundary: int, *, within: bool = True) -> None:
+    """Carry out an operation in this process, and die without a word at its ``boundary``-th boundary.
+
+    Not ``within`` its transactions only those between two of them count.
+    """
     with stores(url) as mine:
         passed = 0
 
@@ -145,8 +148,9 @@ def die_at(url: str, name: str, scene: Scene, boundary: int) -> None:
             if passed == boundary:
                 os._exit(DEAD)
 
-        event.listen(mine.database.engine, "before_cursor_execute", boundary_passed)
-        event.listen(mine.database.engine, "commit", _before(boundary_passed))
+        if within:
+            event.listen(mine.database.engine, "before_cursor_execute", boundary_passed)
+            event.listen(mine.database.engine, "commit", _before(boundary_passed))
         event.listen(mine.database.engine.pool, "reset", boundary_passed)
         OPERATIONS[name].act(mine, scene)
 

@@ -68,12 +68,12 @@ def go_on(mine: Stores) -> None:
     assert_whole(mine)
 
 
-def crash(url: str, name: str, scene: Scene, boundary: int) -> int:
+def crash(url: str, name: str, scene: Scene, boundary: int, *, within: bool = True) -> int:
     """Exit code of a process that has died: forked, since a new one would load for longer than it lives."""
     child = os.fork()
     if child == 0:
         try:
-            die_at(url, name, scene, boundary)
+            die_at(url, name, scene, boundary, within=within)
             os._exit(0)
         except BaseException:  # noqa: BLE001 - it must not go on as a second test process, whatever happened
             traceback.print_exc()
