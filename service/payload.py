@@ -16,9 +16,13 @@ if TYPE_CHECKING:
     from engine import Aperture, Estimate, Quantity, RunResult
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+# Sums are kept of these and of their squares: one that overflowed would keep out every later result of its input.
+Moderate = Annotated[float, Field(ge=-1e100, le=1e100, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-Text = Annotated[str, Field(max_length=2000)]
+_PLAIN = r"^[^\x00]*$"  # PostgreSQL keeps no NUL
+Text = Annotated[str, Field(max_length=2000, pattern=_PLAIN)]
+Word = Annotated[str, Field(max_length=64, pattern=_PLAIN)]
 EstimateName = Literal[
     "paper_wide", "paper_free", "paper_fixed",
     "covariance_wide", "covariance_free", "covariance_fixed",
@@ -43,8 +47,8 @@ class _Strict(BaseModel):
 class QuantityPayload(_Strict):
     """Mean and standard deviation of a recovered quantity, and the truth where there is one."""
 
-    mean: Finite
-    sd: NonNegative
+    mean: Moderate
+    sd: Annotated[Moderate, Field(ge=0.0)]
     truth: Finite | None = None
 
     @property
@@ -98,7 +102,7 @@ class ChainPayload(_Strict):
 class StagePayload(_Strict):
     """Wall and CPU seconds of one stage."""
 
-    stage: Annotated[str, Field(max_length=64)]
+    stage: Word
     wall_s: NonNegative
     cpu_s: NonNegative
 
@@ -106,7 +110,7 @@ class StagePayload(_Strict):
 class ArtefactPayload(_Strict):
     """Where an artefact lies: its key in the store and the SHA-256 of its bytes."""
 
-    key: Annotated[str, Field(max_length=200)]
+    key: Annotated[str, Field(max_length=200, pattern=_PLAIN)]
     digest: Digest
 
 
@@ -118,10 +122,10 @@ class ResultPayload(_Strict):
 
     realization_digest: Digest
     engine_digest: Digest
-    versions: dict[str, Text]
-    noise_treatment: Annotated[str, Field(max_length=32)]
-    regularisation: Annotated[str, Field(max_length=32)]
-    profile: Annotated[str, Field(max_length=32)] | None = None
+    versions: Annotated[dict[Word, Text], Field(max_length=200)]
+    noise_treatment: Annotated[str, Field(max_length=32, pattern=_PLAIN)]
+    regularisation: Annotated[str, Field(max_length=32, pattern=_PLAIN)]
+    profile: Annotated[str, Field(max_length=32, pattern=_PLAIN)] | None = None
     estimates: dict[EstimateName, EstimatePayload | None]
     aperture: AperturePayload | None
     lens: dict[str, QuantityPayload]
@@ -133,8 +137,8 @@ class ResultPayload(_Strict):
     arc_magnitude: Finite
     agn_contrast: Finite | None
     surface_brightness: Finite
-    stages: tuple[StagePayload, ...]
-    warnings: tuple[Text, ...] = ()
+    stages: Annotated[tuple[StagePayload, ...], Field(max_length=1000)]
+    warnings: Annotated[tuple[Text, ...], Field(max_length=1000)] = ()
     figure: ArtefactPayload | None = None
     products: ArtefactPayload | None = None
 

@@ -14,6 +14,7 @@ from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
 from service.api.metrics import Measured
+from service.api.observer import observing
 from service.schemas import Problem
 from service.settings import Settings
 
@@ -52,7 +53,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         # Nothing but connections lives with the application: the dispatcher is a process of its own.
-        yield
+        with observing(context.leadership, context.settings.heartbeat_s):
+            yield
         context.database.close()
 
     app = _App(

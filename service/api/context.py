@@ -32,7 +32,7 @@ class Context:
         # A connection of their own each time, or probes would queue behind whoever waits for the database already.
         self.probed = Database(settings.database, pooled=False)
         self.leadership = Leadership(self.probed, settings.leader_ttl_s)
-        self.metrics = ApiMetrics(self.database)
+        self.metrics = ApiMetrics(self.database, self.leadership)
         self.artefacts = ArtefactStore(settings.artefacts)
 
 

@@ -22,10 +22,10 @@ from prometheus_client.registry import Collector
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.identifiers import utc_now
 from service.process import API_NUMBER, METRICS_DIR
 from service.store.database import Database
 from service.store.depth import Depth, QueueDepth
+from service.store.leadership import Leadership
 
 _LOG = logging.getLogger(__name__)
 _REQUEST_S = (0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.2, 0.5, 1.0, 2.5, 10.0, 60.0)
@@ -41,7 +41,7 @@ class ApiMetrics:
     them. Memory, CPU and descriptors are those of a process, and not told there.
     """
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, leadership: Leadership) -> None:
         self._files = os.environ.get(METRICS_DIR)
         self.registry = CollectorRegistry()
         if self._files is not None:
@@ -69,7 +69,7 @@ class ApiMetrics:
             ProcessCollector(registry=self.registry)
         else:
             MultiProcessCollector(self.registry, self._files)  # type: ignore[no-untyped-call]
-        self.registry.register(_DatabaseCollector(database))
+        self.registry.register(_DatabaseCollector(database, leadership))
 
     def text(self) -> bytes:
         """Everything, in Prometheus's text format."""
@@ -116,9 +116,10 @@ class Measured:
 class _DatabaseCollector(Collector):
     """The queue's depth, and the length of SQLite's log, read at each scrape."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, leadership: Leadership) -> None:
         self._database = database
         self._depth = QueueDepth(database)
+        self._leadership = leadership
 
     def describe(self) -> Iterator[Metric]:
         """Say nothing: to register is no reason to ask the database."""
@@ -136,13 +137,13 @@ class _DatabaseCollector(Collector):
             yield GaugeMetricFamily("hostlens_database_up", _UP, value=0)
             return
         yield GaugeMetricFamily("hostlens_database_up", _UP, value=1)
-        yield from _depth_metrics(depth)
+        yield from _depth_metrics(depth, self._leadership)
 
 
 _UP = "Whether the database answered this scrape"
 
 
-def _depth_metrics(depth: Depth) -> Iterator[Metric]:
+def _depth_metrics(depth: Depth, leadership: Leadership) -> Iterator[Metric]:
     runs = GaugeMetricFamily("hostlens_runs", "Runs that have not ended, by state", labels=("state",))
     for state in ("queued", "delayed", "leased"):
         runs.add_metric((state,), getattr(depth, state))
@@ -154,12 +155,13 @@ def _depth_metrics(depth: Depth) -> Iterator[Metric]:
     waiting = "How long the first run of the queue has been waiting"
     yield GaugeMetricFamily("hostlens_queue_waiting_seconds", waiting, value=depth.waiting_s)
     leader = depth.leader
-    now = utc_now()
-    alive = leader is not None and leader.expires_at > now
+    alive = leader is not None and leadership.beats(leader)
     yield GaugeMetricFamily("hostlens_leader_alive", "Whether a dispatcher leads", value=alive)
     if leader is not None:
-        age = max((now - leader.beat_at).total_seconds(), 0.0)
+        age = leadership.silent_s(leader)
         threads = leader.workers if alive else 0
         yield GaugeMetricFamily("hostlens_leader_generation", "Generation of the last leader", value=leader.generation)
-        yield GaugeMetricFamily("hostlens_leader_heartbeat_age_seconds", "Since its last heartbeat", value=age)
+        yield GaugeMetricFamily(
+            "hostlens_leader_heartbeat_age_seconds", "Since its last heartbeat, as seen from here", value=age
+        )
         yield GaugeMetricFamily("hostlens_leader_workers", "Worker threads that it last had", value=threads)

@@ -34,11 +34,9 @@ def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEng
     if not isinstance(answer, dict) or not {"payload", "error"} & set(answer):
         return _invalid("the worker's answer has neither a payload nor an error")
     if "error" in answer:
-        error = answer["error"]
-        retries = 0 if error["permanent"] else ERROR_RETRIES
-        return Failure(Outcome.ERROR, str(error["code"])[:64], clean(error["message"]), retries)
+        return _read_error(answer["error"])
     if lease.engine is not None and answer.get("engine") != lease.engine:
-        return OtherEngine(clean(answer.get("engine"))[:64])
+        return OtherEngine(clean(answer.get("engine"), 64))
     try:
         payload = read_payload(answer["payload"])
     except InvalidResultError as error:
@@ -46,6 +44,14 @@ def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEng
     if payload.realization_digest != lease.digest:
         return _invalid(f"the result is that of another realization: {payload.realization_digest}")
     return payload
+
+
+def _read_error(error: Any) -> Failure:
+    if not isinstance(error, dict) or not isinstance(error.get("code"), str) or not error["code"]:
+        return _invalid("the worker's error has no code")
+    # Nothing but a plain yes forbids another attempt.
+    retries = 0 if error.get("permanent") is True else ERROR_RETRIES
+    return Failure(Outcome.ERROR, clean(error["code"], 64), clean(error.get("message", "")), retries)
 
 
 def read_exception(error: BaseException) -> Failure:
@@ -71,9 +77,9 @@ def unstorable(error: BaseException) -> Failure:
     return _invalid(f"the database refused the result: {type(error).__name__}")
 
 
-def clean(text: object) -> str:
+def clean(text: object, length: int = 2000) -> str:
     """Text that every database takes: messages of foreign libraries can hold anything."""
-    return str(text).encode("utf-8", "replace").decode("utf-8").replace("\x00", "\ufffd")[:2000]
+    return str(text).encode("utf-8", "replace").decode("utf-8").replace("\x00", "\ufffd")[:length]
 
 
 def _invalid(detail: str) -> Failure:

@@ -6,39 +6,43 @@ import logging
 import math
 import queue as queues
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from threading import Event
 from typing import Any
 
 from distributed import KilledWorker
+from sqlalchemy.exc import SQLAlchemyError
 
 from service import logs
 from service.dispatcher.ahead import Ahead
 from service.dispatcher.attribution import Deaths
-from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, unstorable, worker_lost
+from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, worker_lost
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.metrics import DispatcherMetrics
 from service.dispatcher.placement import Slots
 from service.dispatcher.pool import Pool, Worker, is_lost
+from service.dispatcher.writer import Writer
 from service.payload import ResultPayload
 from service.settings import Settings
-from service.store.database import AWAY
-from service.store.leases import Lease, Outcome
-from service.store.queue import Failure, RunQueue, Stored
+from service.store.faults import AWAY
+from service.store.leadership import LeadershipLostError
+from service.store.leases import Lease, Outcome, Pair
+from service.store.queue import Failure, RunQueue
 
 _LOG = logging.getLogger(__name__)
 _FETCH_S, _GATHER_S = 1.0, 30.0
 _LOOK_S = 1.0
+_SURE_S = 5.0
+"""A look at what has been cancelled is good for so long; without a newer one nothing that waits is started."""
+_AGAIN_S = 10.0
 _MAX_BACK_OFF_S = 10.0
 _EMPTY_LOOKS = 3
 _GONE_S = 1.0
 _NO_WINDOW = 1_000_000
-_STORE_AT_ONCE = 1000
 _BRIEF_S = 10.0
 """Where runs take less, the next are claimed before a worker is free: it waits 30 ms for the database otherwise."""
 
@@ -49,6 +53,7 @@ class Flight:
 
     lease: Lease
     worker: str
+    engine: str
     future: Any
     place: int
     beside: int
@@ -83,17 +88,21 @@ class Dispatcher:
         self._pool: Pool
         self._flights: dict[str, Flight] = {}
         self._done: queues.SimpleQueue[str] = queues.SimpleQueue()
-        self._endings: deque[Callable[[], object]] = deque()
         self._deaths: Deaths[Flight] = Deaths()
         self._slots = Slots(settings.worker_lifetime_s)
         self._ahead = Ahead()
-        self._brief = False
+        self._brief: set[str] = set()
+        """Engines whose runs take little time."""
+        self._turn = 0
+        self._looked = float("-inf")
+        """When it was last seen what has been cancelled and paused."""
         self._suspects: set[str] = set()
         """Engines for which a suspect waits."""
         self._back_off = 0.0
         self._empty_looks = 0
         self._due: dict[str, float] = {}
         self._metrics = metrics or DispatcherMetrics()
+        self._endings = Writer(queue, self._metrics)
         self._metrics.in_flight.set_function(lambda: len(self._flights))
         self._metrics.worker_threads.set_function(lambda: sum(self._heartbeat.engines.values()))
 
@@ -129,12 +138,12 @@ class Dispatcher:
         self._flights.clear()
         self._slots.clear()
         self._give_back([*gone, *waiting], outcome)
-        self._write_endings()
+        self._endings.write()
 
     def _give_back(self, leases: list[Lease], outcome: Outcome) -> None:
         if leases:
             _LOG.info("handing back %d runs: %s", len(leases), outcome)
-            self._endings.append(partial(self._queue.hand_back, leases, outcome))
+            self._endings.hand_back(leases, outcome)
 
     def _guarded(self, step: Callable[[], None], wait: Callable[[float], object]) -> None:
         """One step; where the database is away, a wait that grows."""
@@ -142,32 +151,51 @@ class Dispatcher:
             step()
             self._back_off = 0.0
         except AWAY as error:
+            # Until it is back and was asked, anything may have been cancelled.
+            self._looked = float("-inf")
             self._back_off = min(max(2 * self._back_off, 0.2), _MAX_BACK_OFF_S)
             _LOG.warning("the database is away, next try in %.1f s: %s", self._back_off, error)
             wait(self._back_off)
 
+    def _try(self, what: str, step: Callable[[], None]) -> None:
+        """A part of a step; where the database refuses it for what it is, the others go on, and it is tried later."""
+        if time.monotonic() < self._due.get(f"again {what}", 0.0):
+            return
+        try:
+            step()
+        except (*AWAY, LeadershipLostError):
+            raise
+        except (SQLAlchemyError, ValueError, TypeError):
+            _LOG.exception("the step %s is refused, next try in %.0f s", what, _AGAIN_S)
+            self._metrics.refusals.labels(what).inc()
+            self._due[f"again {what}"] = time.monotonic() + _AGAIN_S
+
     def _step(self) -> None:
-        self._write_endings()
+        self._endings.write()
         workers = self._pool.workers()
         self._tell(workers)
-        self._fill(workers)
+        # Before anything is started: what waits for a worker may have been cancelled or paused meanwhile.
+        if time.monotonic() - self._looked >= _LOOK_S:
+            self._try("look", self._look)
+        self._try("claim", lambda: self._fill(workers))
         # With every worker busy there is nothing to look for in the queue until one of them is done.
         busy = bool(workers) and not self._slots.free(workers)
         self._collect(_LOOK_S if busy else self._settings.poll_s)
         self._look_for_deaths()
-        self._write_endings()
-        if self._is_due("cancel", _LOOK_S) and (self._flights or len(self._ahead)):
-            self._stop_cancelled()
-            self._hold_paused()
+        self._endings.write()
         if self._is_due("reconcile", self._settings.reconcile_s):
-            self._reconcile()
-        if self._is_due("upkeep", self._settings.reconcile_s) and self._queue.upkeep.step():
+            self._try("reconcile", self._reconcile)
+        if self._is_due("upkeep", self._settings.reconcile_s):
+            self._try("upkeep", self._keep_up)
+
+    def _keep_up(self) -> None:
+        if self._queue.upkeep.step():
             self._due["upkeep"] = 0.0  # there may be more, which waits for the next step and not for longer
 
     def _land_and_write(self) -> None:
         self._collect(0.1)
         self._look_for_deaths()
-        self._write_endings()
+        self._endings.write()
 
     def _tell(self, workers: list[Worker]) -> None:
         engines: Counter[str] = Counter()
@@ -180,19 +208,24 @@ class Dispatcher:
         """Claim and place as many runs as there is room for, a suspect first."""
         old = self._slots.outlived(workers, time.monotonic())
         self._pool.stop(old)
-        for engine in {worker.engine for worker in workers}:
+        engines = sorted({worker.engine for worker in workers})
+        # Each first in its turn: what only one of them can have, a suspect or the last of the window, goes round.
+        self._turn = (self._turn + 1) % max(len(engines), 1)
+        for engine in engines[self._turn :] + engines[: self._turn]:
             mine = [worker for worker in workers if worker.engine == engine and worker.address not in old]
             self._fill_lane(engine, mine)
             free = len(self._slots.free(mine))
             # As many again as there are threads: all of them may end in the same moment.
-            threads = free + (sum(worker.threads for worker in mine) if self._brief else 0)
+            threads = free + (sum(worker.threads for worker in mine) if engine in self._brief else 0)
             wanted = min(threads * self._settings.batch - self._ahead.count(engine), self._room())
             if wanted > 0 and self._queue.waiting(engine):
                 self._ahead.put(engine, self._queue.claim(self._generation, wanted, engine))
             self._place_ahead(engine, mine)
 
     def _place_ahead(self, engine: str, workers: list[Worker]) -> None:
-        """Give free workers what was claimed for them."""
+        """Give free workers what was claimed for them, as long as it is known that nobody has cancelled it."""
+        if time.monotonic() - self._looked > _SURE_S:
+            return
         free = self._slots.free(workers)
         threads = sum(worker.threads for worker in workers)
         self._place(self._ahead.take(engine, len(free), threads, self._settings.batch), free)
@@ -216,8 +249,8 @@ class Dispatcher:
                 self._suspects.add(engine)
             else:
                 self._suspects.discard(engine)
-                self._slots.no_suspects()
-        lane = self._slots.lane(workers) if engine in self._suspects and self._room() else None
+                self._slots.no_suspects(engine)
+        lane = self._slots.lane(engine, workers) if engine in self._suspects and self._room() else None
         if lane is not None:
             self._suspects.discard(engine)
             self._place(self._queue.claim(self._generation, 1, engine, suspects=True), [lane])
@@ -236,7 +269,9 @@ class Dispatcher:
             future = self._pool.submit(batch, worker)
             now = time.monotonic()
             for place, lease in enumerate(batch):
-                self._flights[lease.key] = Flight(lease, worker.address, future, place, len(batch) - 1, now)
+                self._flights[lease.key] = Flight(
+                    lease, worker.address, worker.engine, future, place, len(batch) - 1, now
+                )
             future.add_done_callback(lambda done: self._done.put(done.key))
 
     def _remove(self, key: str) -> Flight:
@@ -253,9 +288,7 @@ class Dispatcher:
             for task in tasks:
                 self._land(task, results)
             tasks = self._ended(0.0)
-        if results:
-            for first in range(0, len(results), _STORE_AT_ONCE):
-                self._endings.append(partial(self._store, results[first : first + _STORE_AT_ONCE]))
+        self._endings.store(results)
 
     def _ended(self, wait_s: float) -> list[str]:
         """Dask tasks that have ended since the last look, after a wait for the first of them."""
@@ -285,7 +318,10 @@ class Dispatcher:
                 return  # the worker went before its answer was fetched: a later look finds out what is left
             except Exception as broken:  # noqa: BLE001 - the answer came from another process and may be anything
                 error = broken
-        self._brief = time.monotonic() - flights[0].started < _BRIEF_S
+        if time.monotonic() - flights[0].started < _BRIEF_S:
+            self._brief.add(flights[0].engine)
+        else:
+            self._brief.discard(flights[0].engine)
         for flight in flights:
             self._remove(flight.lease.key)
         if error is not None and len(flights) > 1:
@@ -317,36 +353,13 @@ class Dispatcher:
         if isinstance(ending, Failure):
             told = {**logs.fields_of(lease), "code": ending.code}
             _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, ending.detail, extra=told)
-            self._endings.append(partial(self._queue.fail, lease, ending))
+            self._endings.fail(lease, ending)
         elif isinstance(ending, OtherEngine):
             told = logs.fields_of(lease)
             _LOG.warning("run %s, attempt %d: engine %s", lease.run_id, lease.attempt, ending.digest, extra=told)
-            self._endings.append(partial(self._queue.refuse_engine, lease, ending.digest))
+            self._endings.refuse_engine(lease, ending.digest)
         else:
             results.append((lease, ending))
-
-    def _store(self, results: list[tuple[Lease, ResultPayload]]) -> None:
-        try:
-            stored = self._queue.store_all(results)
-        except AWAY:
-            raise
-        except Exception as error:  # noqa: BLE001 - no result may end the dispatcher, whatever is wrong with it
-            if len(results) > 1:
-                # Nothing was stored; each is tried alone, so that one that is refused keeps no other out.
-                self._endings.extend(partial(self._store, [one]) for one in results)
-                return
-            _LOG.exception("run %s cannot be stored", results[0][0].run_id, extra=logs.fields_of(results[0][0]))
-            self._queue.fail(results[0][0], unstorable(error))
-            return
-        for (lease, _), outcome in zip(results, stored, strict=True):
-            if outcome is not Stored.STORED:
-                told = logs.fields_of(lease)
-                _LOG.warning("run %s, attempt %d came too late: %s", lease.run_id, lease.attempt, outcome, extra=told)
-
-    def _write_endings(self) -> None:
-        while self._endings:
-            self._endings[0]()
-            self._endings.popleft()
 
     def _bury(self, address: str) -> None:
         """A worker died with what it was at."""
@@ -381,13 +394,13 @@ class Dispatcher:
         if verdict is None:
             return
         if verdict.guilty is not None:
-            self._endings.append(partial(self._queue.fail, verdict.guilty.lease, worker_lost()))
+            self._endings.fail(verdict.guilty.lease, worker_lost())
         if verdict.suspects:
             self._suspect(verdict.suspects, f"one of {len(verdict.suspects)} runs may have killed a worker")
 
     def _suspect(self, flights: Sequence[Flight], detail: str) -> None:
         """Runs one of which is to blame go back uncharged, to be tried one at a time."""
-        self._endings.append(partial(self._queue.suspect, [flight.lease for flight in flights], detail))
+        self._endings.suspect([flight.lease for flight in flights], detail)
 
     def _lose(self, flights: Iterable[Flight], detail: str) -> None:
         """Runs that are not to blame go back uncharged."""
@@ -395,24 +408,27 @@ class Dispatcher:
             lease = flight.lease
             told = logs.fields_of(lease)
             _LOG.info("run %s, attempt %d goes back: %s", lease.run_id, lease.attempt, detail, extra=told)
-            self._endings.append(partial(self._queue.requeue_lost, flight.lease, Outcome.FORGOTTEN, detail))
+            self._endings.lose(lease, detail)
 
-    def _stop_cancelled(self) -> None:
-        cancelled = set(self._queue.to_cancel(self._generation))
-        stopped = [key for key, flight in self._flights.items() if flight.lease.run_id in cancelled]
-        for key in stopped:
-            # First the database, then the worker: whatever comes back now finds its lease gone. One by one: should the
-            # database go away in between, the next look would not find those that were cancelled before.
-            self._queue.cancel_leased(self._flights[key].lease)
-            self._stop_workers_of([self._remove(key)])
-        for lease in [lease for lease in self._ahead if lease.run_id in cancelled]:
-            self._queue.cancel_leased(lease)
-        self._ahead.take_where(lambda lease: lease.run_id in cancelled)
+    def _look(self) -> None:
+        """End what has been cancelled, and give back what waits for a worker while its grid is paused."""
+        if self._flights or len(self._ahead):
+            cancelled = self._queue.to_cancel(self._generation)
+            # Out of our hands before the database is asked again: should it be away, nothing of it is started for that.
+            # What comes back from a worker now belongs to no flight, and its lease ends with the next write.
+            stopped = self._take_flights(lambda lease: lease.pair in cancelled)
+            waiting = self._ahead.take_where(lambda lease: lease.pair in cancelled)
+            for lease in [*(flight.lease for flight in stopped), *waiting]:
+                self._endings.cancel(lease)
+            self._stop_workers_of(stopped)
+        if len(self._ahead):
+            paused = self._queue.to_hold(self._generation)
+            self._give_back(self._ahead.take_where(lambda lease: lease.pair in paused), Outcome.HANDED_BACK)
+        self._looked = time.monotonic()
+        self._endings.write()
 
-    def _hold_paused(self) -> None:
-        """Give back what was claimed ahead of grids that have been paused since: it has not been started."""
-        paused = set(self._queue.to_hold(self._generation)) if len(self._ahead) else set()
-        self._give_back(self._ahead.take_where(lambda lease: lease.run_id in paused), Outcome.HANDED_BACK)
+    def _take_flights(self, wanted: Callable[[Lease], bool]) -> list[Flight]:
+        return [self._remove(key) for key, flight in list(self._flights.items()) if wanted(flight.lease)]
 
     def _stop_workers_of(self, flights: list[Flight]) -> None:
         """End what no longer has a lease; runs beside it on the same worker go back when the worker is gone."""
@@ -436,7 +452,7 @@ class Dispatcher:
                 if flight.beside:
                     self._suspect([flight], f"one of {flight.beside + 1} runs was {ending.detail}")
                 else:
-                    self._endings.append(partial(self._queue.fail, flight.lease, ending))
+                    self._endings.fail(flight.lease, ending)
             elif flight.future.done():
                 self._done.put(flight.future.key)  # in case the callback was lost
         self._stop_workers_of(overdue_flights)
@@ -444,10 +460,20 @@ class Dispatcher:
         # While all workers are being started anew nothing is carried for a moment: what was claimed for them waits.
         if carried or stranded:
             self._give_back(self._ahead.take_engines_but(carried), Outcome.FORGOTTEN)
-        self._write_endings()
-        known = [flight.lease for flight in (*self._flights.values(), *self._deaths.waiting)]
-        self._queue.requeue_forgotten(self._generation, [lease.run_id for lease in (*known, *self._ahead)])
+        self._endings.write()
+        self._drop_ended(self._queue.held(self._generation))
+        known = [flight.lease.pair for flight in (*self._flights.values(), *self._deaths.waiting)]
+        self._queue.requeue_forgotten(self._generation, [*known, *(lease.pair for lease in self._ahead)])
         self._queue.release_postdated()
+
+    def _drop_ended(self, held: set[Pair]) -> None:
+        """Stop working at runs whose leases have ended without us; what came of them would be dropped."""
+        dropped = self._take_flights(lambda lease: lease.pair not in held)
+        waiting = self._ahead.take_where(lambda lease: lease.pair not in held)
+        for lease in [*(flight.lease for flight in dropped), *waiting]:
+            told = logs.fields_of(lease)
+            _LOG.warning("run %s, attempt %d: its lease has ended", lease.run_id, lease.attempt, extra=told)
+        self._stop_workers_of(dropped)
 
     def _is_due(self, what: str, every_s: float) -> bool:
         if time.monotonic() < self._due.get(what, 0.0):

@@ -43,6 +43,9 @@ class DispatcherMetrics:
         self.requeued = self._counter("runs_requeued", "Attempts that gave the run back, by their outcome", "reason")
         self.stale = self._counter("results_stale", "Results that came too late, by how they compare", "digest")
         self.database_errors = self._counter("database_errors", "Transactions that the database could not carry out")
+        self.refusals = self._counter(
+            "database_refusals", "What the database refused for what it is: ends of runs, steps of the loop", "what"
+        )
         self.transactions = self._histogram(
             "queue_transaction_duration_seconds", "Transactions of the queue by what they do", _TRANSACTION_S, "what"
         )
@@ -53,12 +56,14 @@ class DispatcherMetrics:
         ProcessCollector(registry=self.registry)
         # A series that appears with the first event hides that event from rate().
         for reason in Outcome:
-            if reason not in {Outcome.DONE, Outcome.CANCELLED}:
+            if reason not in {Outcome.DONE, Outcome.CANCELLED, Outcome.REFUSED}:
                 self.requeued.labels(reason)
         for state in (RunState.DONE, RunState.FAILED, RunState.QUARANTINED, RunState.CANCELLED):
             self.ended.labels(state)
         for digest in ("same", "other"):
             self.stale.labels(digest)
+        for what in ("ending", "look", "claim", "reconcile", "upkeep"):
+            self.refusals.labels(what)
 
     @contextmanager
     def serving(self, settings: Settings) -> Iterator[None]:
@@ -177,3 +182,15 @@ class MeasuredQueue(RunQueue):
             moved = super().cancel_leased(lease)
         self._metrics.ended.labels(RunState.CANCELLED).inc(moved)
         return moved
+
+    def set_aside(self, lease: Lease, reason: Exception) -> bool:
+        """As the queue's."""
+        with self._metrics.transaction("fail"):
+            moved = super().set_aside(lease, reason)
+        self._metrics.ended.labels(RunState.QUARANTINED).inc(moved)
+        return moved
+
+    def note_refused(self, runs: int) -> None:
+        """As the queue's."""
+        self._metrics.refusals.labels("ending").inc(runs)
+        self._metrics.ended.labels(RunState.QUARANTINED).inc(runs)

@@ -90,6 +90,7 @@ def wait_to_lead(database: Database, settings: Settings, stop: Event) -> int | N
             generation = leadership.take(name, is_dead)
         except DBAPIError as error:
             _LOG.warning("cannot ask for the leadership: %s", error)
+            leadership.forget()
             generation = None
         if generation is not None:
             _LOG.info("leading as generation %d", generation)

@@ -5,21 +5,32 @@ Order of locks, everywhere: leader, then grids by id, then runs. A claim locks r
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, literal_column, select, update
 
 from service.store.bulk import insert_rows
+from service.store.faults import AWAY
 from service.store.pace import recent
-from service.store.states import CANCEL, OPEN_STATES, PAUSE, REQUEUE, GridState, RunState, move
+from service.store.states import CANCEL, OPEN_STATES, PAUSE, QUARANTINE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
 
+_LOG = logging.getLogger(__name__)
 AT_ONCE = 5000
 """Runs that one statement may name: databases take so many parameters and no more."""
+ENDING_REFUSED = "ending_refused"
+"""Error code of a run whose end the database would not take."""
+
+Pair = tuple[str, str]
+"""A run and a token. Only together do they name a lease: all runs of one claim share a token."""
+
+LeasedRow = Row[*tuple[Any, ...]]
+"""A leased run, as :func:`leased` reads it."""
 
 
 class Outcome(StrEnum):
@@ -36,6 +47,7 @@ class Outcome(StrEnum):
     DISPATCHER_LOST = "dispatcher_lost"
     FORGOTTEN = "forgotten"
     SCHEDULER_LOST = "scheduler_lost"
+    REFUSED = "refused"
 
 
 @dataclass(frozen=True)
@@ -58,6 +70,11 @@ class Lease:
     suspect: bool = False
 
     @property
+    def pair(self) -> Pair:
+        """What the database knows the lease by."""
+        return self.run_id, self.token
+
+    @property
     def key(self) -> str:
         """Name of the Dask task: never the same twice, so that Dask takes no old answer for a new one.
 
@@ -77,18 +94,13 @@ _LEASED = (
 )
 
 
-def held_by(lease: Lease) -> ColumnElement[bool]:
-    """The run of this lease, as long as the lease is valid."""
-    return (run.c.id == lease.run_id) & (run.c.token == lease.token)
-
-
 def lock_grids(connection: Connection, grid_ids: Iterable[str]) -> None:
     """Let one transaction at a time finish runs of a grid, or two could each take the other's run for unfinished."""
     wanted = select(grid.c.id).where(grid.c.id.in_(sorted(set(grid_ids)))).order_by(grid.c.id)
     connection.execute(wanted.with_for_update(key_share=True)).all()
 
 
-def leased(connection: Connection, where: ColumnElement[bool]) -> Sequence[Row[*tuple[Any, ...]]]:
+def leased(connection: Connection, where: ColumnElement[bool]) -> list[LeasedRow]:
     """The leased runs that ``where`` picks, they and their grids locked to the end of the transaction."""
     # Spelt out, and the grids not made distinct there, or a take-over would go through all runs that ever were.
     condition = (run.c.state == literal_column(f"'{RunState.LEASED}'")) & where
@@ -96,9 +108,18 @@ def leased(connection: Connection, where: ColumnElement[bool]) -> Sequence[Row[*
     return list(connection.execute(select(*_LEASED).where(condition).order_by(run.c.id).with_for_update()).all())
 
 
+def leased_by(connection: Connection, leases: Sequence[Lease]) -> list[LeasedRow]:
+    """The runs of those of the leases that are valid, each once, locked as :func:`leased` does; 5,000 at most."""
+    # Found by their ids, which are the primary key, and compared as pairs: a run may be leased anew, and by the claim
+    # of another run that is asked for beside it.
+    pairs = {lease.pair for lease in leases}
+    rows = leased(connection, run.c.id.in_({lease.run_id for lease in leases}))
+    return [row for row in rows if (row.id, row.token) in pairs]
+
+
 def end_attempts(
     connection: Connection,
-    rows: Sequence[Row[*tuple[Any, ...]]],
+    rows: Sequence[LeasedRow],
     outcome: Outcome,
     now: datetime,
     code: str | None = None,
@@ -126,39 +147,59 @@ def end_attempts(
         )
 
 
+class Requeued(NamedTuple):
+    """Ids of the runs that went back and were not cancelled, and of those that had to be set aside."""
+
+    given: list[str]
+    refused: list[str]
+
+
 def requeue(
     connection: Connection,
-    where: ColumnElement[bool],
+    rows: Sequence[LeasedRow],
     outcome: Outcome,
     now: datetime,
     detail: str | None = None,
     not_before: datetime | None = None,
     suspect: bool = False,
-) -> list[str]:
+) -> Requeued:
     """Give leased runs back to the queue, or cancel or pause those whose grid was cancelled or paused meanwhile.
 
     Without ``not_before`` they keep their place at the head of the queue; as a ``suspect`` they wait in a lane of
-    their own. The ids of those that were not cancelled come back.
+    their own. One that the database refuses keeps no other from going back: it is set aside.
     """
-    rows = leased(connection, where)
     values: dict[str, Any] = {} if not_before is None else {"not_before": not_before}
     if suspect:
         values["suspect"] = True
-    given = []
+    done = Requeued([], [])
     for first in range(0, len(rows), AT_ONCE):
         some = rows[first : first + AT_ONCE]
-        end_attempts(connection, some, outcome, now, detail=detail)
-        given += _requeue(connection, some, outcome, now, values)
-    return given
+        try:
+            with connection.begin_nested():
+                done.given.extend(_requeue(connection, some, outcome, now, values, detail))
+        except AWAY:
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever is wrong with one of them, the others have to go back
+            if len(some) > 1:
+                for row in some:
+                    one = requeue(connection, [row], outcome, now, detail, not_before, suspect)
+                    done.given.extend(one.given)
+                    done.refused.extend(one.refused)
+            else:
+                set_aside(connection, some[0], now, error)
+                done.refused.append(some[0].id)
+    return done
 
 
 def _requeue(
     connection: Connection,
-    rows: Sequence[Row[*tuple[Any, ...]]],
+    rows: Sequence[LeasedRow],
     outcome: Outcome,
     now: datetime,
     values: dict[str, Any],
+    detail: str | None,
 ) -> list[str]:
+    end_attempts(connection, rows, outcome, now, detail=detail)
     ids = [row.id for row in rows]
     moved = move(connection, REQUEUE, run.c.id.in_(ids), **values)
     told = {"outcome": outcome}
@@ -167,11 +208,38 @@ def _requeue(
         [new_event(row.grid_id, "run_requeued", now, row.id, **told, attempt=row.attempt) for row in rows],
     )
     cancelled_grids = select(grid.c.id).where(grid.c.cancelled_at.is_not(None))
-    dropped = move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now)
+    dropped = set(move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now))
     if dropped:
         close_grids(connection, {row.grid_id for row in rows}, now)
     pause_queued(connection, run.c.id.in_(ids))
     return [run_id for run_id in moved if run_id not in dropped]
+
+
+def set_aside(connection: Connection, row: LeasedRow, now: datetime, reason: Exception) -> None:
+    """Quarantine a leased run whose end the database refuses for what it is; the caller holds the locks.
+
+    Its state is what has to change, or it would be in the way of every dispatcher to come. What else belongs to an end
+    is written as far as the database takes it: an attempt may be what it refuses.
+    """
+    _LOG.error("run %s cannot be ended, and is set aside", row.id, exc_info=reason)
+    # The kind alone: the text quotes what was refused, and that may be what the database cannot hold.
+    detail = f"the database refused how this run ended: {type(reason).__name__}"
+    why = {"error_code": ENDING_REFUSED, "error_detail": detail}
+    told = {"attempt": row.attempt, "code": ENDING_REFUSED}
+    parts: tuple[Callable[[], object], ...] = (
+        lambda: move(connection, QUARANTINE, run.c.id == row.id, finished_at=now, **why),
+        lambda: end_attempts(connection, [row], Outcome.REFUSED, now, ENDING_REFUSED, detail),
+        lambda: add_event(connection, row.grid_id, "run_quarantined", now, row.id, **told),
+        lambda: close_grids(connection, [row.grid_id], now),
+    )
+    for write in parts:
+        try:
+            with connection.begin_nested():
+                write()
+        except AWAY:
+            raise
+        except Exception:  # noqa: BLE001 - what it refuses of this either must not keep the others
+            _LOG.exception("a part of the end of run %s is not on record", row.id)
 
 
 def pause_queued(connection: Connection, where: ColumnElement[bool]) -> list[str]:

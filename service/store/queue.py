@@ -9,7 +9,7 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, exists, false, func, literal_column, select, true, update
+from sqlalchemy import ColumnElement, Connection, exists, false, func, literal_column, or_, select, true, update
 
 from service.identifiers import new_token, utc_now
 from service.payload import ResultPayload
@@ -19,26 +19,31 @@ from service.store.leadership import require_generation
 from service.store.leases import (
     AT_ONCE,
     Lease,
+    LeasedRow,
     Outcome,
+    Pair,
     add_event,
     add_events,
     close_grids,
     end_attempts,
-    held_by,
     leased,
+    leased_by,
     lock_grids,
     new_event,
     requeue,
+    set_aside,
 )
 from service.store.results import result_row
 from service.store.settling import held_grids
-from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, RunState, move, moving
+from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move, moving
 from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
 from service.store.upkeep import Upkeep
 
 _MAX_DELAY_S = 600.0
 _JITTER = (0.5, 1.5)
+_DOUBLINGS = 12
+"""Attempts whose back-off is told apart; after more of them it is taken to have reached its bound."""
 _SLACK = timedelta(seconds=1)
 """By so much clocks may differ and nobody minds."""
 
@@ -148,20 +153,22 @@ class RunQueue:
         """
         now = self._clock()
         with self._database.write() as connection:
-            rows = leased(connection, _held_by_any([lease for lease, _ in results]))
-            held = {(row.id, row.token) for row in rows}
-            valid = [(lease, payload) for lease, payload in results if (lease.run_id, lease.token) in held]
+            rows = leased_by(connection, [lease for lease, _ in results])
+            # Taken out as they are used: a lease that comes twice is valid once.
+            held = {(row.id, row.token): row for row in rows}
+            stored = [held.pop(lease.pair, None) is not None for lease, _ in results]
+            valid = [one for one, is_valid in zip(results, stored, strict=True) if is_valid]
             if valid:
                 self._finish(connection, rows, valid, now)
             return [
-                Stored.STORED if (lease.run_id, lease.token) in held else self._stale(connection, lease, payload, now)
-                for lease, payload in results
+                Stored.STORED if is_valid else self._stale(connection, lease, payload, now)
+                for (lease, payload), is_valid in zip(results, stored, strict=True)
             ]
 
     @staticmethod
     def _finish(
         connection: Connection,
-        rows: Sequence[Row[*tuple[Any, ...]]],
+        rows: Sequence[LeasedRow],
         results: Sequence[tuple[Lease, ResultPayload]],
         now: datetime,
     ) -> None:
@@ -188,44 +195,50 @@ class RunQueue:
         """
         now = self._clock()
         with self._database.write() as connection:
-            rows = leased(connection, held_by(lease))
+            rows = leased_by(connection, [lease])
             if not rows:
                 return None
             charged = self._charged(connection, lease, rows[0].charged_from, failure.outcome)
+            mine = run.c.id == lease.run_id
             if charged < failure.retries:
-                delay = min(self._retry_delay_s * 2.0**charged, _MAX_DELAY_S) * random.uniform(*_JITTER)  # noqa: S311
-                later = now + timedelta(seconds=delay)
-                requeue(connection, held_by(lease), failure.outcome, now, failure.detail, later, failure.suspect)
-                return RunState(connection.scalars(select(run.c.state).where(run.c.id == lease.run_id)).one())
+                later = now + self._delay(charged) * random.uniform(*_JITTER)  # noqa: S311
+                self._requeue(connection, rows, failure.outcome, now, failure.detail, later, suspect=failure.suspect)
+                return RunState(connection.scalars(select(run.c.state).where(mine)).one())
             end_attempts(connection, rows, failure.outcome, now, failure.code, failure.detail)
             transition = QUARANTINE if failure.suspect else FAIL
             reason = {"error_code": failure.code, "error_detail": failure.detail}
-            move(connection, transition, held_by(lease), finished_at=now, **reason)
+            move(connection, transition, mine, finished_at=now, **reason)
             kind = f"run_{transition.target}"
             add_event(connection, lease.grid_id, kind, now, lease.run_id, attempt=lease.attempt, code=failure.code)
             close_grids(connection, [lease.grid_id], now)
             return transition.target
 
+    def _delay(self, charged: int) -> timedelta:
+        """Back-off, without jitter, of a run that has been charged so many times before."""
+        return timedelta(seconds=min(self._retry_delay_s * 2.0**charged, _MAX_DELAY_S))
+
     def hand_back(self, leases: Sequence[Lease], outcome: Outcome = Outcome.HANDED_BACK) -> int:
         """Give runs back uncharged, at a stop; how many of the leases were still valid."""
+        return self._give_back(leases, outcome)
+
+    def requeue_lost(self, lease: Lease, outcome: Outcome, detail: str) -> bool:
+        """Give one run back uncharged that went missing through no fault of its own."""
+        return bool(self._give_back([lease], outcome, detail))
+
+    def suspect(self, leases: Sequence[Lease], detail: str) -> int:
+        """Give back runs one of which may have killed a worker: nobody is charged, all wait in the suspect lane."""
+        return self._give_back(leases, Outcome.SUSPECTED, detail, suspect=True)
+
+    def _give_back(
+        self, leases: Sequence[Lease], outcome: Outcome, detail: str | None = None, *, suspect: bool = False
+    ) -> int:
         given = 0
         # Each part is a transaction of its own: what a crash leaves is still leased, and given back by the next leader.
         for first in range(0, len(leases), AT_ONCE):
             with self._database.write() as connection:
-                some = _held_by_any(leases[first : first + AT_ONCE])
-                given += len(requeue(connection, some, outcome, self._clock()))
+                rows = leased_by(connection, leases[first : first + AT_ONCE])
+                given += len(self._requeue(connection, rows, outcome, self._clock(), detail, suspect=suspect))
         return given
-
-    def requeue_lost(self, lease: Lease, outcome: Outcome, detail: str) -> bool:
-        """Give one run back uncharged that went missing through no fault of its own."""
-        with self._database.write() as connection:
-            return bool(requeue(connection, held_by(lease), outcome, self._clock(), detail))
-
-    def suspect(self, leases: Sequence[Lease], detail: str) -> int:
-        """Give back runs one of which may have killed a worker: nobody is charged, all wait in the suspect lane."""
-        with self._database.write() as connection:
-            now = self._clock()
-            return len(requeue(connection, _held_by_any(leases), Outcome.SUSPECTED, now, detail, suspect=True))
 
     def refuse_engine(self, lease: Lease, engine: str) -> bool:
         """Give a run back uncharged whose result came from another engine than its grid's.
@@ -236,33 +249,60 @@ class RunQueue:
             now = self._clock()
             later = now + timedelta(seconds=self._retry_delay_s)
             detail = f"the worker's engine is {engine}, the grid's is {lease.engine}"
-            return bool(requeue(connection, held_by(lease), Outcome.OTHER_ENGINE, now, detail, later))
+            rows = leased_by(connection, [lease])
+            return bool(self._requeue(connection, rows, Outcome.OTHER_ENGINE, now, detail, later))
 
-    def requeue_forgotten(self, generation: int, known: Collection[str]) -> list[str]:
+    def _requeue(self, connection: Connection, *arguments: Any, **options: Any) -> list[str]:
+        done = requeue(connection, *arguments, **options)
+        self.note_refused(len(done.refused))
+        return done.given
+
+    def note_refused(self, runs: int) -> None:
+        """So many runs could not go back to the queue and were set aside; for who counts them."""
+
+    def set_aside(self, lease: Lease, reason: Exception) -> bool:
+        """Quarantine a run whose end the database refuses for what it is; whether the lease was still valid."""
+        with self._database.write() as connection:
+            rows = leased_by(connection, [lease])
+            for row in rows:
+                set_aside(connection, row, self._clock(), reason)
+            return bool(rows)
+
+    def held(self, generation: int) -> set[Pair]:
+        """Runs leased in this generation, each with its token."""
+        with self._database.read() as connection:
+            return self._leased_now(connection, generation)
+
+    def requeue_forgotten(self, generation: int, known: Collection[Pair]) -> list[str]:
         """Give back runs leased in this generation that the dispatcher does not know of.
 
         That happens when a claim was committed and the answer to it was lost. Up to 5,000 at a time; a look that finds
         none, which is the rule, needs no lock.
         """
-        mine = (run.c.state == literal_column(f"'{RunState.LEASED}'")) & (run.c.generation == generation)
-        with self._database.read() as connection:
-            unknown = sorted(set(connection.scalars(select(run.c.id).where(mine))).difference(known))[:AT_ONCE]
+        unknown = sorted(self.held(generation).difference(known))[:AT_ONCE]
         if not unknown:
             return []
         with self._database.write() as connection:
-            these = (run.c.generation == generation) & run.c.id.in_(unknown)
-            return requeue(connection, these, Outcome.FORGOTTEN, self._clock())
+            rows = leased(connection, run.c.id.in_([run_id for run_id, _ in unknown]))
+            these = set(unknown)
+            forgotten = [row for row in rows if (row.id, row.token) in these]
+            return self._requeue(connection, forgotten, Outcome.FORGOTTEN, self._clock())
 
     def release_postdated(self) -> int:
         """Let runs be claimed now that wait for a time which only a clock that was wrong can have set; how many.
 
-        A run that has not been tried waits for nothing, and no retry waits for longer than the longest back-off.
-        Without this a clock that is set back, or that of an API elsewhere which is ahead, would hold up the queue.
+        A run that has not been tried waits for nothing, and no retry waits for longer than the back-off after so many
+        attempts. Without this a clock that is set back, or that of another machine which is ahead, would hold up the
+        queue.
         """
         now = self._clock()
-        longest = timedelta(seconds=_MAX_DELAY_S * _JITTER[1])
+        tries = run.c.attempt - run.c.charged_from
         wrong = (run.c.state == literal_column(f"'{RunState.QUEUED}'")) & (run.c.not_before > now + _SLACK)
-        wrong &= (run.c.attempt == run.c.charged_from) | (run.c.not_before > now + longest)
+        wrong &= or_(
+            tries == 0,
+            *((tries == charged + 1) & self._later_than(now, self._delay(charged)) for charged in range(_DOUBLINGS)),
+            (tries > _DOUBLINGS) & self._later_than(now, timedelta(seconds=_MAX_DELAY_S)),
+        )
         # Not made distinct there, or a database may go through all runs in the order of their grids.
         grids = select(run.c.grid_id).where(wrong)
         with self._database.read() as connection:
@@ -272,35 +312,47 @@ class RunQueue:
             lock_grids(connection, connection.scalars(grids))
             return connection.execute(update(run).where(wrong).values(not_before=now)).rowcount
 
-    def to_hold(self, generation: int) -> list[str]:
-        """Ids of runs leased in this generation whose grid has been paused."""
+    @staticmethod
+    def _later_than(now: datetime, delay: timedelta) -> ColumnElement[bool]:
+        return run.c.not_before > now + _SLACK + delay * _JITTER[1]
+
+    def to_hold(self, generation: int) -> set[Pair]:
+        """Runs leased in this generation whose grid has been paused, each with its token."""
         return self._leased_where(generation, grid.c.paused_at.is_not(None))
 
-    def to_cancel(self, generation: int) -> list[str]:
-        """Ids of runs leased in this generation whose grid has been cancelled."""
+    def to_cancel(self, generation: int) -> set[Pair]:
+        """Runs leased in this generation whose grid has been cancelled, each with its token."""
         return self._leased_where(generation, grid.c.cancelled_at.is_not(None))
 
-    def _leased_where(self, generation: int, condition: ColumnElement[bool]) -> list[str]:
+    def _leased_where(self, generation: int, condition: ColumnElement[bool]) -> set[Pair]:
         with self._database.read() as connection:
-            wanted = (
-                select(run.c.id)
-                .join(grid, grid.c.id == run.c.grid_id)
-                .where(run.c.state == literal_column(f"'{RunState.LEASED}'"), run.c.generation == generation)
-                .where(condition)
-            )
-            return list(connection.scalars(wanted))
+            called = run.c.grid_id.in_(select(grid.c.id).where(condition, _OPEN))
+            return self._leased_now(connection, generation, called)
+
+    @staticmethod
+    def _leased_now(connection: Connection, generation: int, *where: ColumnElement[bool]) -> set[Pair]:
+        mine = (run.c.state == literal_column(f"'{RunState.LEASED}'"), run.c.generation == generation)
+        return {(row.id, row.token) for row in connection.execute(select(run.c.id, run.c.token).where(*mine, *where))}
 
     def cancel_leased(self, lease: Lease) -> bool:
-        """Cancel a run in flight; a result that comes later finds its lease gone."""
+        """Cancel a run in flight, whose result finds its lease gone; False where it was not cancelled.
+
+        Then its lease was gone, or somebody has revived its grid since: it goes back to the queue.
+        """
         now = self._clock()
         with self._database.write() as connection:
-            rows = leased(connection, held_by(lease))
+            rows = leased_by(connection, [lease])
+            if not rows:
+                return False
+            cancelled = select(grid.c.cancelled_at).where(grid.c.id == lease.grid_id)
+            if connection.scalar(cancelled) is None:
+                self._requeue(connection, rows, Outcome.HANDED_BACK, now)
+                return False
             end_attempts(connection, rows, Outcome.CANCELLED, now)
-            moved = move(connection, CANCEL_RUNNING, held_by(lease), finished_at=now)
-            if moved:
-                add_event(connection, lease.grid_id, "run_cancelled", now, lease.run_id, attempt=lease.attempt)
-                close_grids(connection, [lease.grid_id], now)
-            return bool(moved)
+            move(connection, CANCEL_RUNNING, run.c.id == lease.run_id, finished_at=now)
+            add_event(connection, lease.grid_id, "run_cancelled", now, lease.run_id, attempt=lease.attempt)
+            close_grids(connection, [lease.grid_id], now)
+            return True
 
     @staticmethod
     def _charged(connection: Connection, lease: Lease, charged_from: int, outcome: Outcome) -> int:
@@ -321,6 +373,8 @@ class RunQueue:
         return Stored.STALE_SAME if same else Stored.STALE_OTHER
 
 
+# The states are spelt out: a database takes a partial index only where it sees that the condition implies it.
+_OPEN = grid.c.state == literal_column(f"'{GridState.QUEUED}'")
 _ENGINE = select(grid.c.engine_digest).where(grid.c.id == run.c.grid_id).correlate(run).scalar_subquery()
 # All by the statement that claims: each one more is another wait for the server's turn.
 _CLAIMED = (
@@ -336,17 +390,8 @@ _CLAIMED = (
 
 
 def _ready(now: datetime, engine: str | None, suspects: bool) -> ColumnElement[bool]:
-    """Runs that may be claimed for an engine.
-
-    The states are spelt out: a database takes a partial index only where it sees that the condition implies it.
-    """
+    """Runs that may be claimed for an engine."""
     queued = run.c.state == literal_column(f"'{RunState.QUEUED}'")
     ready = queued & (run.c.suspect == (true() if suspects else false())) & (run.c.not_before <= now)
     others = None if engine is None else grid.c.engine_digest != engine
     return ready & run.c.grid_id.not_in(held_grids(others))
-
-
-def _held_by_any(leases: Sequence[Lease]) -> ColumnElement[bool]:
-    """The runs of these leases, as long as the leases are valid."""
-    wanted = run.c.id.in_([lease.run_id for lease in leases])
-    return wanted & run.c.token.in_({lease.token for lease in leases})

@@ -14,10 +14,11 @@ from typing import Any
 
 from sqlalchemy import Connection, event
 
+from service.identifiers import utc_now
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
-from service.store.leases import Lease, Outcome
+from service.store.leases import Lease, Outcome, end_attempts, leased_by
 from service.store.queue import Failure, RunQueue
 from tests.service.plans import body, planned, result_of, submit
 
@@ -86,6 +87,14 @@ def _failed(mine: Stores) -> Scene:
     return scene
 
 
+def _poisoned(mine: Stores) -> Scene:
+    """The first lease cannot be ended: its attempt is on record as ended already."""
+    scene = prepare(mine)
+    with mine.database.write() as connection:
+        end_attempts(connection, leased_by(connection, scene.leases[:1]), Outcome.DONE, utc_now())
+    return scene
+
+
 def _last(mine: Stores) -> Scene:
     """A grid whose last run is under way."""
     grid_id = submit(mine.grids, 1)
@@ -116,6 +125,12 @@ OPERATIONS = {
     "store the last": Operation(
         lambda mine, scene: mine.queue.store(scene.leases[0], result_of(scene.leases[0])), _last
     ),
+    "store several": Operation(
+        lambda mine, scene: mine.queue.store_all([(lease, result_of(lease)) for lease in scene.leases])
+    ),
+    "set aside": Operation(lambda mine, scene: mine.queue.set_aside(scene.leases[0], ValueError("refused"))),
+    "lose": Operation(lambda mine, scene: mine.queue.requeue_lost(scene.leases[0], Outcome.FORGOTTEN, "gone")),
+    "take-over of what is refused": Operation(lambda mine, _: mine.lead(), _poisoned),
     "retry": Operation(lambda mine, scene: mine.queue.fail(scene.leases[0], BROKEN)),
     "fail": Operation(lambda mine, scene: mine.queue.fail(scene.leases[0], PERMANENT)),
     "quarantine the last": Operation(lambda mine, scene: mine.queue.fail(scene.leases[0], CRASHED), _last),
@@ -127,6 +142,7 @@ OPERATIONS = {
     "requeue": Operation(lambda mine, scene: mine.queue.requeue_forgotten(scene.generation, [])),
     "take-over": Operation(lambda mine, _: mine.lead()),
     "cancel": Operation(lambda mine, scene: mine.grids.cancel(scene.grid_id)),
+    "cancel running that was revived": Operation(lambda mine, scene: mine.queue.cancel_leased(scene.leases[0])),
     "cancel running": Operation(lambda mine, scene: mine.queue.cancel_leased(scene.leases[0]), _cancelled),
     "pause": Operation(lambda mine, scene: mine.grids.pause(scene.grid_id)),
     "resume": Operation(lambda mine, scene: mine.grids.resume(scene.grid_id), _paused),

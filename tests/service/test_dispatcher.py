@@ -233,7 +233,7 @@ def test_workers_that_are_away_for_a_moment_keep_their_runs_and_ones_that_stay_a
 def test_what_was_claimed_ahead_waits_while_all_workers_are_started_anew(database: Database, tmp_path: Path) -> None:
     pool = InstantPool(tmp_path, "pending", "pending")
     setting = Setting(database, pool, runs=6, reconcile_s=0.001)
-    setting.dispatcher._brief = True
+    setting.dispatcher._brief.add(setting.pool.engine)
     setting.run(until=lambda: setting.grids.grid(setting.grid_id).counts.leased == 4)
     pool.addresses = []
     setting.run(steps=2)
@@ -299,7 +299,7 @@ def test_a_run_that_had_ended_on_a_worker_that_the_next_one_killed_is_not_suspec
     pool = Unreachable(tmp_path, "pending", "pending")
     pool.addresses = ["a"]
     setting = Setting(database, pool, runs=2)
-    setting.dispatcher._brief = True
+    setting.dispatcher._brief.add(setting.pool.engine)
     setting.run(until=lambda: len(pool.submitted) == 1)
     pool.futures[0].finish(tmp_path)
     setting.run(steps=2000)
@@ -367,7 +367,7 @@ def ahead(database: Database, tmp_path: Path) -> Setting:
     """Two runs on workers, and two that were claimed for when these are done."""
     pool = InstantPool(tmp_path, *["pending"] * 2)
     setting = Setting(database, pool, runs=6, engine=engine_digest(), reconcile_s=0.02)
-    setting.dispatcher._brief = True
+    setting.dispatcher._brief.add(setting.pool.engine)
     setting.run(until=lambda: len(setting.pool.submitted) == 2)
     assert (setting.grids.grid(setting.grid_id).counts.leased, len(setting.pool.submitted)) == (4, 2)
     return setting

@@ -150,8 +150,11 @@ def test_what_becomes_of_runs_is_counted_after_it_was_committed(database: Databa
     generation = Leadership(database, clock=clock).take("here")
     assert generation == 1
     queue = MeasuredQueue(metrics, database, clock, retry_delay_s=1.0)
-    submit(grids, 8)
-    stored, failed, again, dead, cancelled, lost, suspect, other = queue.claim(generation, 8)
+    submit(grids, 7)
+    clock.advance(1)
+    unwanted = submit(grids, 1, seed=10)
+    stored, failed, again, dead, lost, suspect, other, cancelled = queue.claim(generation, 8)
+    grids.cancel(unwanted)
     queue.store(stored, result_of(stored))
     queue.store(stored, result_of(stored))
     queue.fail(failed, Failure(Outcome.ERROR, "error", "bad", 0))

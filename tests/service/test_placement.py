@@ -25,15 +25,15 @@ def test_a_suspect_gets_a_worker_that_nothing_else_is_on_or_comes_to() -> None:
     for key in "12":
         slots.take("b", key, alone=False)
     # No worker is empty: this one is given nothing more until it is.
-    assert slots.lane([FOUR]) is None
+    assert slots.lane("e", [FOUR]) is None
     assert slots.free([FOUR]) == []
     slots.release("b", "1")
-    assert slots.lane([FOUR]) is None
+    assert slots.lane("e", [FOUR]) is None
     slots.release("b", "2")
-    assert slots.lane([FOUR]) == FOUR
+    assert slots.lane("e", [FOUR]) == FOUR
     slots.take("b", "suspect", alone=True)
     assert slots.free([FOUR]) == []
-    assert slots.lane([FOUR, ONE]) is None, "one suspect at a time"
+    assert slots.lane("e", [FOUR, ONE]) is None, "one suspect at a time"
     slots.release("b", "suspect")
     assert len(slots.free([FOUR])) == 4
 
@@ -41,9 +41,40 @@ def test_a_suspect_gets_a_worker_that_nothing_else_is_on_or_comes_to() -> None:
 def test_a_worker_is_not_kept_empty_for_a_suspect_that_is_gone() -> None:
     slots = Slots()
     slots.take("b", "1", alone=False)
-    assert slots.lane([FOUR]) is None
-    slots.no_suspects()
+    assert slots.lane("e", [FOUR]) is None
+    slots.no_suspects("e")
     assert len(slots.free([FOUR])) == 3
+
+
+def test_what_waits_for_one_engine_keeps_or_frees_no_worker_of_another() -> None:
+    other = Worker("c", 1, "other", 0.0)
+    slots = Slots()
+    for address in "bc":
+        slots.take(address, address, alone=False)
+    assert slots.lane("e", [FOUR]) is None
+    slots.no_suspects("other")
+    assert slots.free([FOUR, other]) == [], "the worker is emptied for a suspect that still waits"
+    assert slots.lane("other", [other]) is None
+    slots.no_suspects("e")
+    slots.release("c", "c")
+    assert [worker.address for worker in slots.free([FOUR, other])] == ["b", "b", "b"]
+    assert slots.lane("other", [other]) == other
+    # Where ports are fixed the next worker of another engine may have the address that one was kept empty at.
+    assert slots.lane("e", [FOUR]) is None
+    assert len(slots.free([Worker("b", 4, "other", 0.0)])) == 3
+
+
+def test_no_worker_is_kept_empty_while_the_suspect_of_another_engine_is_under_way() -> None:
+    other = Worker("c", 1, "other", 0.0)
+    slots = Slots()
+    slots.take("b", "1", alone=False)
+    assert slots.lane("e", [FOUR]) is None
+    slots.take("c", "suspect", alone=True)
+    assert slots.lane("e", [FOUR]) is None
+    assert [worker.address for worker in slots.free([FOUR, other])] == ["b", "b", "b"]
+    slots.release("c", "suspect")
+    slots.release("b", "1")
+    assert slots.lane("e", [FOUR]) == FOUR
 
 
 def test_workers_that_have_lived_long_are_started_anew_when_idle_and_not_all_at_once() -> None:
