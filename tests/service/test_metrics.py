@@ -14,7 +14,7 @@ from sqlalchemy import event, text
 
 from service.api.app import create_app
 from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
-from service.settings import Settings
+from service.settings import ConfigurationError, Settings
 from service.store.database import Database
 from service.store.depth import QueueDepth
 from service.store.grids import GridStore
@@ -215,5 +215,5 @@ def test_a_metrics_port_that_is_taken_is_said_and_not_passed_over() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         settings = Settings(metrics_port=taken.getsockname()[1])
-        with pytest.raises(OSError, match="in use"), DispatcherMetrics().serving(settings):
+        with pytest.raises(ConfigurationError, match="in use"), DispatcherMetrics().serving(settings):
             pass
