@@ -40,28 +40,25 @@ SEED = 5
 
 @dataclass(frozen=True)
 class Layout:
-    """Nodes a side, their crowding (None: even), and whether the source is regularised relative to the envelope."""
+    """Nodes a side, and whether the source is regularised relative to the envelope."""
 
     side: int
-    softening: float | None = None
     envelope: bool = True
 
     @property
     def name(self) -> str:
         """As in the tables."""
-        nodes = "even" if self.softening is None else f"crowded {self.softening:g}"
-        return f"{self.side} x {self.side} {nodes}, {'envelope' if self.envelope else 'no envelope'}"
+        return f"{self.side} x {self.side}, {'envelope' if self.envelope else 'no envelope'}"
 
     @property
     def model(self) -> SourceModel:
         """The regularised source."""
-        return SourceModel((self.side, self.side), softening=self.softening)
+        return SourceModel((self.side, self.side))
 
 
 LAYOUTS = (
     *(Layout(side) for side in (15, 20, 30, 40)),
     Layout(30, envelope=False),
-    Layout(30, 0.5, envelope=False),
 )
 
 

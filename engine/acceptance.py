@@ -7,7 +7,7 @@ import math
 from engine.errors import SpecError
 from engine.imaging.geometry import exposure_geometry
 from engine.imaging.psf import coarsest_subpixel
-from engine.posterior.target import TYPICAL_LN_LAMBDA, wide_prior
+from engine.posterior.target import wide_prior
 from engine.scene import check_analysis, power_law_lens, resolve_camera, resolve_dither, resolve_system
 from engine.spec import Realization
 
@@ -59,7 +59,7 @@ def _check_priors(realization: Realization) -> None:
     system, own = resolve_system(realization), realization.analysis.priors
     mass = system.mass_model(realization.mass_model, realization.l_eta)
     # Round the true lens, which the fit that the run starts from is close to.
-    widest = wide_prior(power_law_lens(mass), TYPICAL_LN_LAMBDA, shear=any(mass.shear or ()))
+    widest = wide_prior(power_law_lens(mass), shear=any(mass.shear or ()))
     stated = {name: prior for name, prior in system.priors.items() if name not in own}
     for where, priors in (("system", stated), ("analysis", own)):
         try:

@@ -287,7 +287,10 @@ def measure_image(
             except (PosteriorError, InversionError, ObservationError) as error:
                 warnings.append(f"inversion: {error}")
     residual = observation.image - fit.model
-    scale = noise_scale(observation, residual, fit.sigma, fit.lens)
+    measured = noise_scale(observation, residual, fit.sigma, fit.lens)
+    if measured is None:
+        warnings.append("noise: too few pixels outside the lens to compare its map with the scatter, taken as it is")
+    scale = 1.0 if measured is None else measured
     chi2 = _chi2(observation, fit, residual, scale) / fit.degrees_of_freedom
     if abs(scale - 1.0) > _NOISE_AGREES:
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")

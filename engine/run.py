@@ -27,15 +27,15 @@ from engine.inversion.mapping import SourceGrid
 from engine.inversion.problem import Problem, prepare_problem
 from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
+from engine.light.cell_means import profile_on_grid
 from engine.light.sersic import SersicProfile, mean_surface_brightness
 from engine.modelling.parametric import ParametricFit, fit_parametric
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
-from engine.posterior.target import TYPICAL_LN_LAMBDA, Target, wide_prior
+from engine.posterior.target import Target, wide_prior
 from engine.refits.draws import DrawSet, source_draw
 from engine.refits.estimators import refit_draws
-from engine.refits.profiles import profile_on_grid
 from engine.refits.sersic_fit import Refit
 from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import (
@@ -180,10 +180,8 @@ def prepare_target(problem: Problem, fit: ParametricFit, analysis: Analysis, *, 
     source = SourceModel(
         analysis.source_pixels,
         analysis.regularisation,
-        analysis.source_softening,
-        analysis.regularisation_length,
     )
-    prior = wide_prior(fit.lens, TYPICAL_LN_LAMBDA, shear=shear).restricted(analysis.priors)
+    prior = wide_prior(fit.lens, shear=shear).restricted(analysis.priors)
     anchors = problem.operator.rays.anchors
     agn = None
     if analysis.agn_position_sd is not None:

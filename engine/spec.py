@@ -64,7 +64,7 @@ NoiseLevel = Literal["author", "handbook"]
 ProfileName = Literal["draft", "standard", "reference", "paper"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
 LensParameterName = Literal["theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda"]
-RegularisationName = Literal["zeroth", "gradient", "curvature", "matern"]
+RegularisationName = Literal["zeroth", "gradient", "curvature"]
 _Read = TypeVar("_Read")
 _SLOPE_TOLERANCE = 1e-9
 
@@ -353,12 +353,10 @@ class Analysis:
     ``mask_inner`` and ``mask_outer`` bound the ring of fitted pixels in units of the measured Einstein radius;
     ``core_radius`` [arcsec] is the region round each AGN image whose noise is boosted to be effectively infinite;
     ``subrays`` rays are traced along each side of an image pixel; ``ray_margin`` [pixels] is how far outside the
-    mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid,
-    evenly spaced where ``source_softening`` is None, else crowded round the AGN within that fraction of its half-width;
-    with ``source_envelope`` the regularisation asks for a smooth ratio of the source to the host of the parametric fit,
+    mask rays still count because the PSF carries their light in; ``source_pixels`` is (ny, nx) of the source grid; with
+    ``source_envelope`` the regularisation asks for a smooth ratio of the source to the host of the parametric fit,
     otherwise for a smooth source. ``walkers`` walk until the chain is ``chain_length`` autocorrelation times long, or
     for ``max_steps``.
-    ``regularisation_length`` is the correlation length of ``matern`` [source pixels], without effect otherwise.
     ``priors`` of the lens parameters, by name, come before those of the system. With ``agn_position_sd`` [arcsec per
     axis] the measured positions of the AGN images have to come from one point of the source plane. ``background_sd``
     [e-/s in a pixel] is how well the sky was taken off before; where None the background is free.
@@ -366,9 +364,7 @@ class Analysis:
 
     profile: ProfileName = "standard"
     source_pixels: tuple[Annotated[Count, Field(ge=2, le=80)], Annotated[Count, Field(ge=2, le=80)]] = (20, 20)
-    source_softening: Annotated[Number, Field(gt=0.01, le=1e3)] | None = None
     regularisation: RegularisationName = "curvature"
-    regularisation_length: Annotated[Number, Field(ge=0.1, le=100.0)] = 3.0
     noise_treatment: NoiseTreatment = "covariance"
     mask_inner: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.4
     mask_outer: Annotated[Number, Field(gt=1.0, le=5.0)] = 1.65
@@ -427,8 +423,6 @@ class Realization:
         # Left out where it is not used, so that realizations from before there was such a field keep their digests.
         if dumped["optics"] is None:
             del dumped["optics"]
-        if dumped["analysis"]["regularisation"] != "matern":
-            del dumped["analysis"]["regularisation_length"]
         for name in ("agn_position_sd", "background_sd"):
             if dumped["analysis"][name] is None:
                 del dumped["analysis"][name]

@@ -111,7 +111,7 @@ def _map_and_curve(
     operator: Operator, lens: PowerLawLens, model: SourceModel, memory: FloatArray | None = None
 ) -> tuple[Mapping, FloatArray]:
     """L and F, which lies in ``memory`` where that is given."""
-    mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape, model.softening)
+    mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape)
     return mapping, curvature_matrix(operator.coupling, operator.border, mapping, memory)
 
 

@@ -17,14 +17,11 @@ from numpy.typing import NDArray
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
-from engine.inversion.nodes import spaced_nodes
 from engine.lensing.power_law import PowerLawLens, trace_rays
 from engine.lensing.power_law import kernel_arguments as kernel_arguments_of_lens
+from engine.light.cell_means import profile_on_grid
 from engine.light.radial_table import look_up, tabulate
 from engine.light.sersic import SersicProfile, kernel_arguments, sersic_k, sersic_normalisation
-
-_CELL_POINTS = 8
-"""Gauss points along a cell of the source for the mean of the envelope."""
 
 FALL = 0.25
 """Width of the fall beyond the edges, in cells: a hundredth of an arcsec, far more than a lens' posterior moves it."""
@@ -70,19 +67,19 @@ def _edges(nodes: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class PlacedEnvelope:
-    """An envelope in the source plane of one lens: packed profile, radial table, floor."""
+    """An envelope in the source plane of one lens: a profile that is one at r_eff, its radial table, a floor."""
 
-    light: FloatArray
+    profile: SersicProfile
     table: FloatArray
     floor: float
 
     def on_cells(self, grid: SourceGrid) -> FloatArray:
-        """Its mean (ny nx,) over the cells round the nodes."""
-        points, weights = np.polynomial.legendre.leggauss(_CELL_POINTS)
-        return np.asarray(
-            _envelope_means(grid.x_edges, grid.y_edges, 0.5 * (points + 1.0), 0.5 * weights, self.light, self.table)
-            + self.floor
-        )
+        """Its mean (ny nx,) over the cells round the nodes, that of the cusp's cell to a hundredth of itself."""
+        return profile_on_grid(self.profile, grid.x_edges, grid.y_edges) + self.floor
+
+    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Its value (k,) at points of the source plane [arcsec], to 2e-7 of the centre."""
+        return np.asarray(_envelope_at(x, y, kernel_arguments(self.profile), self.table, self.floor))
 
 
 @dataclass(frozen=True)
@@ -112,15 +109,20 @@ class Envelope:
     def host(self) -> SersicProfile:
         """The profile where it lies behind ``lens``, with the flux at which it is one at r_eff."""
         p = self.profile
-        one = sersic_normalisation(p.n, p.r_eff) * math.exp(-sersic_k(p.n))
-        return replace(p, flux=1.0 / one, x=self.anchor[0] + p.x, y=self.anchor[1] + p.y)
+        return _one_at_r_eff(replace(p, x=self.anchor[0] + p.x, y=self.anchor[1] + p.y))
 
     def placed(self, x: float, y: float, size: float) -> PlacedEnvelope:
         """The envelope about anchors at (x, y) [arcsec] on a grid of side ``size`` [arcsec]."""
         stretch = size / self.size
         p = self.profile
-        moved = replace(p, flux=1.0, r_eff=p.r_eff * stretch, x=x + p.x * stretch, y=y + p.y * stretch)
-        return PlacedEnvelope(kernel_arguments(moved), self._table, self.floor)
+        moved = replace(p, r_eff=p.r_eff * stretch, x=x + p.x * stretch, y=y + p.y * stretch)
+        return PlacedEnvelope(_one_at_r_eff(moved), self._table, self.floor)
+
+
+def _one_at_r_eff(profile: SersicProfile) -> SersicProfile:
+    """The profile with the flux at which its brightness at r_eff is one."""
+    bright = sersic_normalisation(profile.n, profile.r_eff) * math.exp(-sersic_k(profile.n))
+    return replace(profile, flux=1.0 / bright)
 
 
 @dataclass(frozen=True)
@@ -306,24 +308,6 @@ def _fill(
 
 
 @kernel
-def _envelope_means(
-    xe: FloatArray, ye: FloatArray, points: FloatArray, gauss: FloatArray, light: FloatArray, table: FloatArray
-) -> FloatArray:
-    nx, ny = xe.size - 1, ye.size - 1
-    out = np.zeros(nx * ny)
-    for j in range(ny):
-        for i in range(nx):
-            for b in range(points.size):
-                dy = ye[j] + points[b] * (ye[j + 1] - ye[j]) - light[8]
-                for a in range(points.size):
-                    dx = xe[i] + points[a] * (xe[i + 1] - xe[i]) - light[7]
-                    u, v = light[5] * dx + light[6] * dy, light[5] * dy - light[6] * dx
-                    z = (light[4] * u * u + v * v / light[4]) * light[3]
-                    out[j * nx + i] += gauss[a] * gauss[b] * look_up(z, table)
-    return out
-
-
-@kernel
 def _envelope_at(bx: FloatArray, by: FloatArray, light: FloatArray, table: FloatArray, floor: float) -> FloatArray:
     out = np.empty(bx.size)
     for i in range(bx.size):
@@ -355,18 +339,12 @@ def _transpose(
     return out
 
 
-def map_rays(
-    rays: RayBundle,
-    lens_arguments: tuple[FloatArray, FloatArray],
-    shape: tuple[int, int],
-    softening: float | None = None,
-) -> Mapping:
+def map_rays(rays: RayBundle, lens_arguments: tuple[FloatArray, FloatArray], shape: tuple[int, int]) -> Mapping:
     """Trace the rays through the lens and lay the source grid of ``shape`` (ny, nx) round those of the mask.
 
-    ``lens_arguments`` are those of :func:`engine.lensing.power_law.kernel_arguments`. With a ``softening`` the nodes
-    crowd round the mapped anchors: their spacing is even within that fraction of the half-width and widens beyond.
-    Where the rays have an envelope, the source is that times a function bilinear between the nodes. An InversionError
-    tells of a mask without pixels or rays that all fall on one line of the source plane.
+    ``lens_arguments`` are those of :func:`engine.lensing.power_law.kernel_arguments`. Where the rays have an envelope,
+    the source is that times a function bilinear between the nodes. An InversionError tells of a mask without pixels or
+    rays that all fall on one line of the source plane.
     """
     ny, nx = shape
     if not rays.in_mask.any():
@@ -379,21 +357,18 @@ def map_rays(
         raise InversionError(
             f"mask: its rays span {right - left} x {top - bottom} arcsec of the source plane, an area is needed"
         )
-    centre_x, centre_y = 0.5 * (left + right), 0.5 * (bottom + top)
-    if rays.anchors.size:
-        ax, ay = np.empty(len(rays.anchors)), np.empty(len(rays.anchors))
-        trace_rays(
-            np.ascontiguousarray(rays.anchors[:, 0]), np.ascontiguousarray(rays.anchors[:, 1]), *lens_arguments, ax, ay
-        )
-        centre_x, centre_y = float(ax.mean()), float(ay.mean())
-    grid = SourceGrid(
-        spaced_nodes(left, right, nx, centre_x, softening), spaced_nodes(bottom, top, ny, centre_y, softening)
-    )
+    grid = SourceGrid(np.linspace(left, right, nx), np.linspace(bottom, top, ny))
     at_rays = np.empty(0)
     placed = None
     if rays.envelope is not None:
+        centre_x, centre_y = 0.5 * (left + right), 0.5 * (bottom + top)
+        if rays.anchors.size:
+            ax, ay = np.empty(len(rays.anchors)), np.empty(len(rays.anchors))
+            anchor_x, anchor_y = np.ascontiguousarray(rays.anchors.T)
+            trace_rays(anchor_x, anchor_y, *lens_arguments, ax, ay)
+            centre_x, centre_y = float(ax.mean()), float(ay.mean())
         placed = rays.envelope.placed(centre_x, centre_y, math.sqrt((right - left) * (top - bottom)))
-        at_rays = _envelope_at(bx, by, placed.light, placed.table, placed.floor)
+        at_rays = placed.at(bx, by)
     columns = np.empty((rays.columns, 4 * per_pixel), dtype=np.int32)
     weights = np.empty((rays.columns, 4 * per_pixel))
     entries = np.empty(rays.columns, dtype=np.int32)

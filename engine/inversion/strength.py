@@ -1,7 +1,8 @@
-"""The regularisation strength: the lambda that maximises the evidence, and the evidence of every lambda at once.
+"""The regularisation strength: the lambda that maximises the evidence.
 
 With gamma = tr(A^-1 F) the number of parameters that the data determine and E = lambda s^T H s the penalty of the
-solution, d ln Z / d ln lambda = (gamma - E) / 2 (Gull 1989; MacKay 1992, section 4.4). Two ways lead to its zero.
+solution, d ln Z / d ln lambda = (gamma - E) / 2 (Gull 1989; MacKay 1992, section 4.4). Its zero is
+what is looked for.
 
 :func:`find_strength` factorises A at a few values of lambda and takes Newton steps on phi = ln gamma - ln E, which
 is far straighter in ln lambda than the derivative itself: gamma and E both fall and rise as powers of lambda. Its
@@ -9,20 +10,15 @@ slope follows from the same factorisation,
 
     d gamma / d ln lambda = -lambda tr(X - lambda X^2),      X = H A^-1,
     d E / d ln lambda     = E - 2 lambda^2 s^T X H s.
-
-:func:`reduce_strengths` makes H the identity and F tridiagonal by orthogonal transformations, once; every lambda then
-costs one tridiagonal system, O(n), and no factorisation at all.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from scipy.linalg import eigvalsh_tridiagonal, lapack, solve_triangular
-from scipy.optimize import brentq
+from scipy.linalg import lapack
 
 from engine.compiled import kernel
 from engine.conventions import FloatArray
@@ -32,7 +28,6 @@ from engine.inversion.operator import Operator
 from engine.inversion.regularisation import (
     SourceModel,
     add_regularisation,
-    regularisation_matrix,
     sparse_regularisation,
 )
 from engine.lensing.power_law import PowerLawLens
@@ -47,7 +42,6 @@ _LONGEST_STEP = 8.0
 _MAX_FACTORISATIONS = 60
 _DECIDED = 1e-6
 """Where gamma is below this share of n, every mode falls as 1 / lambda, and n - lambda tr(X) is rounding."""
-_SPECTRUM_ROUNDING = 64.0 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True)
@@ -55,7 +49,7 @@ class Strength:
     """Where the evidence of a lens has its maximum in ln lambda.
 
     ``curvature`` is the second derivative of ln Z there (negative); ``effective_parameters`` is gamma;
-    ``factorisations`` counts the Cholesky factorisations of A that were tried, or 1 for a reduction.
+    ``factorisations`` counts the Cholesky factorisations of A that were tried.
     """
 
     ln_lambda: float
@@ -136,7 +130,7 @@ def find_strength(
     """Find the maximum of the evidence in ln lambda to 1e-3, by Newton steps kept between ``low`` and ``high``.
 
     The search begins at ``start``, or where lambda H is a hundredth of F in the trace; it climbs, so that of several
-    maxima it finds one near there (:func:`reduce_strengths` finds the highest).
+    maxima it finds one near there.
 
     Raises
     ------
@@ -205,113 +199,3 @@ class _Bracket:
         if wanted <= self.below and self.below == self._low and not self._low_tried:
             return self._low
         return 0.5 * (self.below + self.above)
-
-
-@cache
-def _prior_factor(model: SourceModel) -> FloatArray:
-    """Lower Cholesky factor of H, in Fortran order, read-only."""
-    factor = np.asfortranarray(np.linalg.cholesky(regularisation_matrix(model)))
-    factor.setflags(write=False)
-    return factor
-
-
-@dataclass(frozen=True)
-class StrengthReduction:
-    """The evidence of one lens as a function of lambda alone.
-
-    With H = R R^T and R^-1 F R^-T = Q T Q^T, T tridiagonal (``diagonal`` (n,), ``off_diagonal`` (n - 1,), its
-    ``eigenvalues`` those of F relative to H), A = R Q (T + lambda) Q^T R^T. ``data_vector`` is Q^T R^-1 D and
-    ``constant`` what does not depend on lambda.
-    """
-
-    diagonal: FloatArray
-    off_diagonal: FloatArray
-    eigenvalues: FloatArray
-    data_vector: FloatArray
-    constant: float
-
-    @property
-    def lowest(self) -> float:
-        """Ln lambda below which rounding of the eigenvalues may decide the evidence."""
-        return math.log(_SPECTRUM_ROUNDING * self.eigenvalues.size * self.eigenvalues[-1])
-
-    def _resolvent(self, strength: float, rhs: FloatArray) -> FloatArray:
-        """(T + lambda)^-1 rhs."""
-        _, _, solution, info = lapack.dptsv(self.diagonal + strength, self.off_diagonal, rhs)
-        if info != 0:
-            raise InversionError(
-                f"ln lambda: got {math.log(strength):.1f}, allowed is at least {self.lowest:.1f} for this lens"
-            )
-        return np.asarray(solution)
-
-    def _strength(self, ln_lambda: float) -> float:
-        if not ln_lambda >= self.lowest:
-            raise InversionError(f"ln lambda: got {ln_lambda:.1f}, allowed is at least {self.lowest:.1f} for this lens")
-        return math.exp(ln_lambda)
-
-    def ln_evidence(self, ln_lambda: float) -> float:
-        """Ln Z, as :func:`engine.inversion.evidence.ln_evidence` has it; an InversionError below ``lowest``."""
-        strength = self._strength(ln_lambda)
-        quadratic = float(self.data_vector @ self._resolvent(strength, self.data_vector))
-        # n ln lambda - ln|T + lambda|, without cancellation for large lambda.
-        return self.constant + 0.5 * quadratic - 0.5 * float(np.log1p(self.eigenvalues / strength).sum())
-
-    def derivatives(self, ln_lambda: float) -> tuple[float, float, float]:
-        """First and second derivative of ln Z with respect to ln lambda, and gamma."""
-        strength = self._strength(ln_lambda)
-        share = self.eigenvalues / (self.eigenvalues + strength)
-        gamma = float(share.sum())
-        once = self._resolvent(strength, self.data_vector)
-        penalty = strength * float(once @ once)
-        gamma_change = -float((share * (1.0 - share)).sum())
-        penalty_change = penalty - 2.0 * strength**2 * float(once @ self._resolvent(strength, once))
-        return 0.5 * (gamma - penalty), 0.5 * (gamma_change - penalty_change), gamma
-
-    def optimum(self, low: float | None = None, high: float = HIGHEST) -> Strength:
-        """The highest maximum of ln Z inside ``low`` (default: the lowest allowed) to ``high``, to 1e-9.
-
-        Raises
-        ------
-        InversionError
-            The evidence has no maximum inside.
-        """
-        low = self.lowest if low is None else max(low, self.lowest)
-        if not low < high:
-            raise SpecError("ln lambda", (low, high), "an interval with its lower end first")
-        grid = np.linspace(low, high, max(3, math.ceil(2.0 * (high - low))))
-        slopes = np.array([self.derivatives(float(t))[0] for t in grid])
-        turns = np.flatnonzero((slopes[:-1] > 0.0) & (slopes[1:] <= 0.0))
-        if not turns.size:
-            raise _no_maximum(low, high, rising=bool(slopes[-1] > 0.0))
-        found = [
-            float(brentq(lambda t: self.derivatives(t)[0], grid[turn], grid[turn + 1], xtol=1e-9)) for turn in turns
-        ]
-        at = max(found, key=self.ln_evidence)
-        _, curvature, gamma = self.derivatives(at)
-        return Strength(at, curvature, gamma, 1)
-
-
-def reduce_strengths(operator: Operator, lens: PowerLawLens, model: SourceModel) -> StrengthReduction:
-    """Reduce a lens' evidence to a function of lambda: one O(n^3) reduction, about eight factorisations' worth."""
-    f, d = normal_equations(operator, lens, model)
-    r = _prior_factor(model)
-    # f is valid in its lower triangle; seen in Fortran order that is the upper one of the same symmetric matrix.
-    reduced, _ = lapack.dsygst(np.asfortranarray(f), r, itype=1, lower=1, overwrite_a=1)
-    lwork, _ = lapack.dsytrd_lwork(d.size, lower=1)
-    reflectors, diagonal, off_diagonal, tau, _ = lapack.dsytrd(reduced, lower=1, lwork=int(lwork), overwrite_a=1)
-    vector = solve_triangular(r, d, lower=True)
-    if d.size > 1:
-        rotated, _, _ = lapack.dormqr("L", "T", reflectors[1:, :-1], tau, vector[1:, None], 64)
-        vector[1:] = rotated[:, 0]
-    eigenvalues = np.maximum(eigvalsh_tridiagonal(diagonal, off_diagonal), 0.0)
-    constant = operator.ln_constant - 0.5 * operator.dd
-    return StrengthReduction(diagonal, off_diagonal, eigenvalues, vector, constant)
-
-
-def evidence_of_strengths(
-    operator: Operator, lens: PowerLawLens, ln_lambdas: FloatArray, model: SourceModel
-) -> FloatArray:
-    """Ln Z of one lens for many ln lambda, same shape, by one reduction; an InversionError where one is too low."""
-    reduction = reduce_strengths(operator, lens, model)
-    values = [reduction.ln_evidence(float(t)) for t in np.ravel(ln_lambdas)]
-    return np.array(values).reshape(np.shape(ln_lambdas))

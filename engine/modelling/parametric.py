@@ -133,13 +133,19 @@ class ParametricFit:
 
 @dataclass(frozen=True)
 class _Solution:
-    """A minimum: the model it belongs to, its parameters and its cost (chi^2 and priors)."""
+    """A minimum between bounds: the model it belongs to, its parameters and its cost (chi^2 and priors).
+
+    ``stamp_error`` is the error of the AGN's stamps that its noise map holds, in units of what is allowed for.
+    """
 
     model: ImageModel
     values: FloatArray
+    low: FloatArray
+    high: FloatArray
     cost: float
     evaluations: int
     start: Start
+    stamp_error: float = 1.0
 
 
 def _start_vector(layout: Layout, start: Start, centre: tuple[float, float]) -> FloatArray:
@@ -192,13 +198,13 @@ def _minimise(
         model.residuals, inside, partial(model.jacobian, integrated=integrated), (low, high), x_scale="jac",
         xtol=tolerance, ftol=tolerance, max_nfev=steps,
     )  # fmt: skip
-    return _Solution(model, fit.x, 2.0 * float(fit.cost), int(fit.nfev), start)
+    return _Solution(model, fit.x, low, high, 2.0 * float(fit.cost), int(fit.nfev), start)
 
 
 def _minimise_held(solution: _Solution, values: FloatArray, at: int, held: float) -> _Solution:
     """The minimum with parameter ``at`` held, from other values of the rest."""
     model = solution.model
-    low, high = (np.delete(side, at) for side in _bounds(model, solution.values))
+    low, high = (np.delete(side, at) for side in (solution.low, solution.high))
 
     def whole(free: FloatArray) -> FloatArray:
         return np.insert(free, at, held)
@@ -213,7 +219,7 @@ def _minimise_held(solution: _Solution, values: FloatArray, at: int, held: float
         ftol=_TOLERANCE,
         max_nfev=_INTEGRATED_STEPS,
     )
-    return _Solution(model, whole(fit.x), 2.0 * float(fit.cost), int(fit.nfev), solution.start)
+    return replace(solution, values=whole(fit.x), cost=2.0 * float(fit.cost), evaluations=int(fit.nfev))
 
 
 def _stamp_radius(psf: FloatArray) -> int:
@@ -319,12 +325,14 @@ class _Finder:
     ) -> None:
         self.observation, self.has_deflector, self.acceptance = observation, deflector, acceptance
         self.shear, self.may_shear = shear, shear is not False
-        self.priors, self.stamp_error = priors, 1.0
+        self.priors = priors
         self.image = filled_image(observation)
         self.noise = np.where(
             observation.valid, observation.noise, float(np.median(observation.noise[observation.valid]))
         )
-        self.centre = deflector_centre(self.image, observation.pixel_scale) if deflector else (0.0, 0.0)
+        shining = deflector_centre(self.image, observation.pixel_scale) if deflector else None
+        # A lens whose light shows nowhere near the middle is looked for there all the same.
+        self.centre = (0.0, 0.0) if shining is None else shining
         self.evaluations = 0
 
     def _candidates(self, most: int) -> tuple[Detection, ...]:
@@ -439,13 +447,12 @@ class _Finder:
         layout = solution.model.layout
         values = _with_shear(solution.values, layout, shear=shear)
         model = self._model(replace(layout, shear=shear), sigma)
-        sampled = _minimise(model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE)
-        self.evaluations += sampled.evaluations
-        if sampled.cost > _HOPELESS * self.acceptance.chi2_per_dof * model.pixels:
-            return sampled
-        found = _minimise(model, solution.start, sampled.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
+        found = _minimise(model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE)
         self.evaluations += found.evaluations
-        return found
+        if found.cost <= _HOPELESS * self.acceptance.chi2_per_dof * model.pixels:
+            found = _minimise(model, solution.start, found.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
+            self.evaluations += found.evaluations
+        return replace(found, stamp_error=solution.stamp_error)
 
     def _variances(self, solution: _Solution) -> tuple[FloatArray, FloatArray]:
         """Variance (ny, nx) allowed for the stamps of the AGN images as they were fitted, and for extended light."""
@@ -460,23 +467,27 @@ class _Finder:
         """Standard deviation of the pixels of the final fit, the PSF's errors included; infinite where not fitted."""
         values, layout = solution.values, solution.model.layout
         stamps, extended = self._variances(solution)
-        sigma = weights_sigma(self.observation, self.stamp_error**2 * stamps + extended)
+        sigma = weights_sigma(self.observation, solution.stamp_error**2 * stamps + extended)
         agn = _fitted_agn(layout, values, solution.model.amplitudes(values)[0], solution.start.agn)
         sigma[~self._fitted(lens_of(values[layout.lens_slice]), agn)] = np.inf
         return sigma
 
-    def _measured_stamp_error(self, solution: _Solution) -> float:
-        """Error of the AGN's stamps in units of what is allowed for, as the residuals of a full fit have it."""
+    def _measured_stamp_error(self, solution: _Solution) -> float | None:
+        """Error of the AGN's stamps in units of what is allowed for, as the residuals of a full fit have it.
+
+        None where there are no stamps, or their residuals do not tell.
+        """
         model, values, layout = solution.model, solution.values, solution.model.layout
         if not layout.n_agn or self.observation.response is not None:
-            return 1.0
+            return None
         _, rest, _ = model.amplitudes(values)
         counted = np.isfinite(model.sigma)
         residual = rest.reshape(self.observation.shape) * np.where(counted, model.sigma, 0.0)
         stamps, extended = self._variances(solution)
         noise = weights_sigma(self.observation)
         scale = noise_scale(self.observation, residual, model.sigma, lens_of(values[layout.lens_slice]))
-        others = np.where(counted, (scale * noise) ** 2 + extended, np.inf)
+        scaled = noise if scale is None else scale * noise
+        others = np.where(counted, scaled**2 + extended, np.inf)
         return measured_stamp_error(residual, stamps, others)
 
     def _model(self, layout: Layout, sigma: FloatArray) -> ImageModel:
@@ -490,16 +501,22 @@ class _Finder:
         """The fit of the whole image from another one; with shear where it is wanted, or is worth its parameters."""
         best = self._full(solution, self._sigma(solution), shear=self.may_shear)
         error = self._measured_stamp_error(best)
-        if error != self.stamp_error:
-            self.stamp_error = error
+        if error is not None:
+            best = replace(best, stamp_error=error)
             best = self._full(best, self._sigma(best), shear=self.may_shear)
         if self.shear is None and not self._shear_shows(best):
             best = self._full(best, best.model.sigma, shear=False)
         for _ in range(_CORRECTIONS if self.observation.response is not None else 0):
             best.model.correct(best.values)
-            best = _minimise(best.model, best.start, best.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
-            self.evaluations += best.evaluations
+            best = self._again(best)
         return best
+
+    def _again(self, solution: _Solution) -> _Solution:
+        """The minimum of a model that has been changed since, from where it was."""
+        model, start = solution.model, solution.start
+        found = _minimise(model, start, solution.values, _INTEGRATED_STEPS, _TOLERANCE, integrated=True)
+        self.evaluations += found.evaluations
+        return replace(found, stamp_error=solution.stamp_error)
 
     def _shear_shows(self, solution: _Solution) -> bool:
         """Whether a fit's shear differs from none by more than its covariance lets expect."""
@@ -605,7 +622,7 @@ class _Finder:
             chi2=chi2,
             degrees_of_freedom=freedom,
             evaluations=self.evaluations,
-            stamp_error=self.stamp_error,
+            stamp_error=solution.stamp_error,
             at_bound=_at_bound(solution),
             model=(columns @ amplitudes).reshape(shape),
             arc=(columns[:, -2] * flux).reshape(shape),
@@ -673,7 +690,7 @@ def _host_posterior(solution: _Solution, covariance: FloatArray, held: float | N
     flux = float(solution.model.amplitudes(values)[0][-2])
     chosen = [layout.size + layout.amplitudes - 2, *range(where.start, where.stop)]
     scale = np.array([1.0 / flux, *np.ones(6)])
-    low, high = (side[where] for side in _bounds(solution.model, values))
+    low, high = solution.low[where].copy(), solution.high[where].copy()
     if held is not None:
         low[1] = high[1] = held
     ended = _at_bound(solution)
@@ -688,9 +705,8 @@ def _host_posterior(solution: _Solution, covariance: FloatArray, held: float | N
 
 
 def _at_bound(solution: _Solution) -> tuple[str, ...]:
-    """Names of the parameters of host, lens and deflector that ended at a bound."""
-    layout, values = solution.model.layout, solution.values
-    low, high = _bounds(solution.model, values)
+    """Names of the parameters of AGN images, lens, deflector and host that ended at a bound of their fit."""
+    layout, values, low, high = solution.model.layout, solution.values, solution.low, solution.high
     names = [f"agn{k // 2 + 1}.{'xy'[k % 2]}" for k in range(2 * layout.n_agn)]
     light = ("ln r_eff", "n", "e1", "e2", "x", "y")
     names += [f"deflector.{name}" for name in light] if layout.deflector else []

@@ -55,22 +55,24 @@ def _shift_variance(light: FloatArray, scale: float, shift: float, fraction: flo
     return np.asarray((fraction * light) ** 2 + shift**2 * steep)
 
 
-def noise_scale(observation: Observation, residual: FloatArray, sigma: FloatArray, lens: PowerLawLens) -> float:
+def noise_scale(observation: Observation, residual: FloatArray, sigma: FloatArray, lens: PowerLawLens) -> float | None:
     """Scatter of the residuals (ny, nx) outside the lens in units of ``sigma``, by the median of their moduli.
 
-    One, where there are too few pixels to tell.
+    None where there are too few pixels to tell.
     """
     ny, nx = observation.shape
     scale = observation.pixel_scale
     x, y = pixel_centres(nx, scale) - lens.x, pixel_centres(ny, scale) - lens.y
     chosen = (np.hypot(y[:, None], x[None, :]) > _OUTSKIRTS * lens.theta_E) & np.isfinite(sigma)
     if int(chosen.sum()) < _FEWEST_OUTSIDE:
-        return 1.0
+        return None
     return _MAD * float(np.median(np.abs(residual[chosen] / sigma[chosen])))
 
 
-def measured_stamp_error(residual: FloatArray, stamps: FloatArray, others: FloatArray) -> float:
+def measured_stamp_error(residual: FloatArray, stamps: FloatArray, others: FloatArray) -> float | None:
     """Error of the AGN's stamps in units of what is allowed for, from the residuals where it outweighs all else.
+
+    None where it outweighs the rest in too few pixels to tell.
 
     How wrong a stamp is depends on where between the pixels its star and the AGN images stand, and on who made it. The
     mean square residual there is what variances say it is, but for the limits :data:`_STAMP_RANGE`.
@@ -82,7 +84,7 @@ def measured_stamp_error(residual: FloatArray, stamps: FloatArray, others: Float
     """
     chosen = np.isfinite(others) & (stamps > others)
     if int(chosen.sum()) < _FEWEST_AT_STAMPS:
-        return 1.0
+        return None
     square, at_stamps, rest = residual[chosen] ** 2, stamps[chosen], others[chosen]
 
     def excess(ln_error: float) -> float:

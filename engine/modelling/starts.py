@@ -54,10 +54,10 @@ def filled_image(observation: Observation) -> FloatArray:
     return np.where(observation.valid, observation.image, np.where(np.isfinite(smooth), smooth, level))
 
 
-def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, float]:
+def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, float] | None:
     """The peak [arcsec] that is reached by climbing from the middle of the image, smoothed by a pixel.
 
-    It is the middle of the image where the climb leaves the inner half arcsec, as without a deflector's light.
+    None where the climb leaves the inner half arcsec, as without a deflector's light.
     """
     smooth = ndimage.gaussian_filter(image, 1.0)
     ny, nx = image.shape
@@ -71,7 +71,7 @@ def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, floa
             break
         row, column = row + int(step[0]) - 1, column + int(step[1]) - 1
         if math.hypot(row - start_row, column - start_column) > reach:
-            return 0.0, 0.0
+            return None
     out = []
     for values in (smooth[row, column - 1 : column + 2], smooth[row - 1 : row + 2, column]):
         bend = float(values[0] - 2.0 * values[1] + values[2])

@@ -20,8 +20,6 @@ from engine.spec import LensParameterName, ParameterPrior
 LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")
 SHEAR_NAMES = ("gamma1", "gamma2")
 STRENGTH = "ln_lambda"
-TYPICAL_LN_LAMBDA = -10.0
-"""Middle of the interval that is searched for ln lambda, 40 wide: lambda has units, but no scene strays that far."""
 
 
 # What the lens model can be at all; priors that are asked for end here.
@@ -103,18 +101,23 @@ def _turns(value: float, middle: float, name: str) -> float:
     return middle + math.remainder(value - middle, math.pi) - value if name == "phi" else 0.0
 
 
-def wide_prior(lens: PowerLawLens, ln_lambda: float, *, shear: bool) -> Prior:
+LN_LAMBDA_RANGE = (-30.0, 10.0)
+"""ln lambda [lambda has the units of the source's inverse square] strays that far in no scene."""
+
+
+def wide_prior(lens: PowerLawLens, *, shear: bool) -> Prior:
     """The prior round a starting lens where nothing else is asked for.
 
     theta_E within 30 %, q in (0.2, 1), the angle within 90 degrees, slope in (1.3, 2.7), the centre within 0.3
-    arcsec, shear components within 0.4, ln lambda within 20 of the start: far wider than any posterior of the study.
+    arcsec, shear components within 0.4, ln lambda in (-30, 10): far wider than any posterior of the study.
     """
     low = [0.7 * lens.theta_E, 0.2, lens.phi - math.pi / 2, 1.3, lens.x - 0.3, lens.y - 0.3]
     high = [1.3 * lens.theta_E, 1.0, lens.phi + math.pi / 2, 2.7, lens.x + 0.3, lens.y + 0.3]
     names: tuple[str, ...] = LENS_NAMES
     if shear:
         names, low, high = names + SHEAR_NAMES, [*low, -0.4, -0.4], [*high, 0.4, 0.4]
-    return Prior.flat((*names, STRENGTH), np.array([*low, ln_lambda - 20.0]), np.array([*high, ln_lambda + 20.0]))
+    least, most = LN_LAMBDA_RANGE
+    return Prior.flat((*names, STRENGTH), np.array([*low, least]), np.array([*high, most]))
 
 
 @dataclass

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from engine.conventions import FloatArray
+from engine.light.cell_means import columns_on_grid
 from engine.refits.draws import SourceDraw
 from engine.refits.least_squares import NormalEquations
-from engine.refits.profiles import columns_on_grid
 from engine.refits.source_plane import stacked
 
 

@@ -15,8 +15,8 @@ from engine.conventions import FloatArray
 from engine.inversion.evidence import Inversion
 from engine.inversion.mapping import SourceGrid
 from engine.lensing.power_law import PowerLawLens
+from engine.light.cell_means import MAX_ELLIPTICITY
 from engine.modelling.host_posterior import HostPosterior
-from engine.refits.profiles import MAX_ELLIPTICITY
 from engine.result import IndexPrior
 
 _SMALLEST_RADIUS = 0.1

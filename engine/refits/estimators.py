@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
+from engine.light.cell_means import LN_R_EFF, N, X, Y, profile_of
 from engine.refits.covariance import CovarianceMetric
 from engine.refits.draws import DrawSet, SourceDraw
 from engine.refits.image import refit_image
 from engine.refits.least_squares import Fits, Metric, fit_shapes, scatter
 from engine.refits.paper import PaperMetric
-from engine.refits.profiles import LN_R_EFF, N, X, Y, profile_of
 from engine.refits.projected import ProjectedMetric
 from engine.refits.sersic_fit import Refit, SersicFit
 from engine.result import INDEX_RANGES, EstimatorName, IndexPrior

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
-from engine.refits.profiles import COLUMNS
+from engine.light.cell_means import COLUMNS
 
 _FLUX = COLUMNS - 1
 _MAX_ROUNDS = 40

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
+from engine.light.cell_means import columns_on_grid
 from engine.refits.draws import SourceDraw
 from engine.refits.least_squares import NormalEquations
-from engine.refits.profiles import columns_on_grid
 from engine.refits.source_plane import rest_per_point, stacked
 
 

@@ -75,7 +75,7 @@ class Case:
 
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""
-        mapping = map_rays(self.rays, kernel_arguments(lens), model.shape, model.softening)
+        mapping = map_rays(self.rays, kernel_arguments(lens), model.shape)
         g = np.hstack([self.blurring @ mapping.dense(), self.columns])
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance

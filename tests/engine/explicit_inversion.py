@@ -11,7 +11,7 @@ from scipy.signal import convolve2d
 from engine.inversion.blurring import blurring_matrix
 from engine.inversion.mapping import RayBundle, cast_rays
 from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.inversion.regularisation import SourceModel, regularisation_matrix
+from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens, source_position
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
@@ -118,17 +118,10 @@ class Explicit:
         return source_position(self.lens, x[..., None] + dx, y[..., None] + dy)
 
     def nodes(self, model: SourceModel) -> tuple[np.ndarray, np.ndarray]:
-        bx, by = self._rays()
-        centre = [float(np.mean(c)) for c in source_position(self.lens, ANCHORS[:, 0], ANCHORS[:, 1])]
         out = []
-        for values, n, middle in zip((bx, by), model.shape[::-1], centre, strict=True):
+        for values, n in zip(self._rays(), model.shape[::-1], strict=True):
             low, high = values[self.chosen].min(), values[self.chosen].max()
-            if model.softening is None:
-                out.append(low + (high - low) * np.arange(n) / (n - 1))
-                continue
-            s = model.softening * (high - low) / 2
-            t = np.linspace(np.arcsinh((low - middle) / s), np.arcsinh((high - middle) / s), n)
-            out.append(middle + s * np.sinh(t))
+            out.append(low + (high - low) * np.arange(n) / (n - 1))
         return out[0], out[1]
 
     def source_columns(self, model: SourceModel) -> np.ndarray:
@@ -201,9 +194,7 @@ class Answer:
 
 
 def regularisation(model: SourceModel) -> np.ndarray:
-    """H from its definition on an even grid; the engine's on another, which its own tests look after."""
-    if model.softening is not None:
-        return regularisation_matrix(model)
+    """H from its definition."""
     ny, nx = model.shape
     if model.regularisation == "zeroth":
         return np.eye(ny * nx)
@@ -214,8 +205,4 @@ def regularisation(model: SourceModel) -> np.ndarray:
     tx, ty = second(nx), second(ny)
     if model.regularisation == "curvature":
         tx, ty = tx @ tx, ty @ ty
-    sum_ = np.kron(np.eye(ny), tx) + np.kron(ty, np.eye(nx))
-    if model.regularisation == "matern":
-        k = 2.0 / model.length**2 * np.eye(ny * nx) + sum_
-        return k @ k
-    return sum_
+    return np.asarray(np.kron(np.eye(ny), tx) + np.kron(ty, np.eye(nx)))

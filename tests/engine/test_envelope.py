@@ -9,7 +9,7 @@ import pytest
 from engine.imaging.drizzling import drizzle
 from engine.imaging.extended import lensed_sersic_image
 from engine.inversion.evidence import invert, ln_evidence
-from engine.inversion.mapping import Envelope, map_rays
+from engine.inversion.mapping import Envelope, SourceGrid, map_rays
 from engine.inversion.problem import prepare_problem
 from engine.inversion.regularisation import SourceModel
 from engine.inversion.strength import find_strength
@@ -65,23 +65,42 @@ def test_a_constant_ratio_is_the_envelope_itself_also_beyond_the_grid() -> None:
     bare = replace(case.rays, envelope=None)
     grid = map_rays(bare, kernel_arguments(LENS), (5, 5)).grid
     assert np.array_equal(grid.x, mapping.grid.x)
-    # The packed profile of the envelope, one at r_eff, and its floor, summed over the rays of each pixel.
-    k = placed.light[1]
-    host = SersicProfile(
-        1.0,
-        1.0 / math.sqrt(placed.light[3]),
-        0.5 / placed.light[2],
-        placed.light[4],
-        0.6,
-        placed.light[7],
-        placed.light[8],
-    )
     x, y = source_position(LENS, case.rays.x, case.rays.y)
-    shape = surface_brightness(host, x, y) / placed.light[0] * math.exp(k) + placed.floor
+    shape = surface_brightness(placed.profile, x, y) + placed.floor
     per_pixel = case.rays.subrays**2
     expected = shape.reshape(-1, per_pixel).mean(axis=1) * case.rays.pixel_area
     # The radial table is good to 2e-7 of the centre.
     assert np.allclose(fluxes, expected, rtol=1e-5)
+
+
+def mean_over_cell(profile: SersicProfile, grid: SourceGrid, row: int, column: int) -> float:
+    """Mean over a cell with the cusp, by rectangles that meet there and nodes that crowd towards it."""
+    nodes, weights = np.polynomial.legendre.leggauss(80)
+    u, w = 0.5 * (nodes + 1.0), 0.5 * weights
+    # With s = u^10 the integrand is smooth in u: Sersic profiles of n = 8 go as s^(1/8).
+    s, ds = u**10, 10.0 * u**9 * w
+    total = 0.0
+    for x_edge in grid.x_edges[column : column + 2]:
+        for y_edge in grid.y_edges[row : row + 2]:
+            width, height = x_edge - profile.x, y_edge - profile.y
+            x, y = np.meshgrid(profile.x + width * s, profile.y + height * s)
+            total += abs(width * height) * float(ds @ surface_brightness(profile, x, y) @ ds)
+    return total / float(grid.cell_areas[row, column])
+
+
+@pytest.mark.parametrize("n", [0.5, 1.0, 4.0, 8.0])
+@pytest.mark.parametrize("offset", [0.0, 0.4])
+def test_the_mean_of_the_cell_with_the_cusp_is_that_of_its_integral(n: float, offset: float) -> None:
+    # Eight points a side of a cell were short by 3.7 % for n = 4 and 14 % for n = 8.
+    nodes = np.linspace(-0.6, 0.6, 25)
+    grid, cell = SourceGrid(nodes, nodes), 0.05
+    profile = SersicProfile(1.0, 0.39, n, 0.7, 0.6, 0.0, 0.0)
+    placed = Envelope(profile, 0.05, 1.2, LENS, (0.0, 0.0)).placed(offset * cell, offset * cell, 1.2)
+    found = placed.on_cells(grid).reshape(25, 25)
+    # A core that holds 3e-3 of the flux is not cut any more: 1e-2 of this cell at the worst place, mostly 1e-3.
+    assert found[12, 12] == pytest.approx(mean_over_cell(placed.profile, grid, 12, 12) + 0.05, rel=1.2e-2)
+    far = surface_brightness(placed.profile, nodes[3:4], nodes[3:4])[0] + 0.05
+    assert found[3, 3] == pytest.approx(far, rel=0.02)  # the curvature of the profile over a cell
 
 
 @pytest.fixture(scope="module", params=[2.0, 4.0])
@@ -120,7 +139,7 @@ def test_noise_free_data_are_left_well_below_the_noise(seen: tuple[Simulation, P
 def test_the_evidence_peaks_at_the_true_lens_within_its_own_width(seen: tuple[Simulation, ParametricFit]) -> None:
     simulation, fit = seen
     operator = prepare_problem(simulation.observation, fit, Analysis()).operator
-    target = Target(operator, wide_prior(fit.lens, -10.0, shear=False), MODEL)
+    target = Target(operator, wide_prior(fit.lens, shear=False), MODEL)
     start = target.vector(fit.lens, optimal_strength(target, fit.lens))
     found = find_optimum(target, start, start_covariance(fit.lens_covariance))
     away = (found.mean - target.vector(simulation.scene.lens, 0.0))[:-1]

@@ -33,7 +33,6 @@ MODELS = [
     SourceModel((10, 10), "curvature"),
     SourceModel((9, 13), "gradient"),
     SourceModel((12, 7), "zeroth"),
-    SourceModel((11, 11), "curvature", 0.2),
 ]
 
 
@@ -78,29 +77,15 @@ def test_the_source_draws_have_the_posterior_mean_and_covariance() -> None:
     assert np.abs(np.corrcoef(draws.T) - expected).max() < 0.08
 
 
-@pytest.mark.parametrize("softening", [None, 0.15, 1e3])
 @pytest.mark.parametrize("name", ["zeroth", "gradient", "curvature"])
 @pytest.mark.parametrize("shape", [(2, 2), (5, 9), (14, 11)])
-def test_ln_determinant_of_the_regularisation(name: str, shape: tuple[int, int], softening: float | None) -> None:
-    model = SourceModel(shape, name, softening)  # type: ignore[arg-type]
+def test_ln_determinant_of_the_regularisation(name: str, shape: tuple[int, int]) -> None:
+    model = SourceModel(shape, name)  # type: ignore[arg-type]
     h = regularisation_matrix(model)
     sign, expected = np.linalg.slogdet(h)
     assert sign == 1.0
     assert ln_determinant(model) == pytest.approx(expected, abs=1e-8)
     assert np.allclose(h, h.T, rtol=1e-12)
-    # The weights of thin cells are one on an even grid, which a great softening gives.
-    if softening == 1e3:
-        assert np.allclose(h, regularisation_matrix(SourceModel(shape, name)), rtol=1e-4)  # type: ignore[arg-type]
-
-
-def test_stripes_across_thin_cells_cost_more_than_differences_from_node_to_node() -> None:
-    model = SourceModel((15, 15), "curvature", 0.15)
-    even = SourceModel((15, 15), "curvature")
-    # Alternating values along x in the outermost row, where the cells in the middle are thin and tall.
-    stripes = np.zeros((15, 15))
-    stripes[1, 5:10] = [1.0, -1.0, 1.0, -1.0, 1.0]
-    vector = stripes.ravel()
-    assert vector @ regularisation_matrix(model) @ vector > 20 * (vector @ regularisation_matrix(even) @ vector)
 
 
 @settings(max_examples=15, deadline=None)

@@ -18,7 +18,7 @@ from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.modelling.image_model import ImageModel, Layout, lens_of, sersic_of
 from engine.modelling.lens_start import lens_from_positions
-from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.modelling.parametric import GOOD_START, ParametricFit, _at_bound, _Finder, fit_parametric
 from engine.modelling.point_sources import find_point_sources
 from engine.modelling.psf_error import measured_stamp_error
 from engine.modelling.starts import ring_radii
@@ -221,4 +221,30 @@ def test_residuals_that_no_stamp_explains_change_its_error_by_no_more_than_is_al
     stamps, others = np.full((9, 9), 10.0), np.ones((9, 9))
     assert measured_stamp_error(np.full((9, 9), 1e3), stamps, others) == 5.0
     assert measured_stamp_error(np.zeros((9, 9)), stamps, others) == 0.5
-    assert measured_stamp_error(np.ones((9, 9)), 0.1 * others, others) == 1.0
+    assert measured_stamp_error(np.ones((9, 9)), 0.1 * others, others) is None
+
+
+def finder_of(observation: Observation) -> _Finder:
+    return _Finder(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
+
+
+def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulation: Simulation) -> None:
+    # Three pixels from where it is: its bounds are two pixels about where the fit begins.
+    shift = 3.0 * simulation.observation.pixel_scale
+    places = [(agn.x + (shift if k == 0 else 0.0), agn.y) for k, agn in enumerate(scene.agn)]
+    finder = finder_of(simulation.observation)
+    (group,) = finder.starts(None, None, places)
+    (found,) = finder.quick(group)
+    assert "agn1.x" in _at_bound(found)
+    (group,) = finder.starts(4, None, None)
+    (found,) = finder.quick(group)
+    assert not _at_bound(found)
+
+
+def test_what_one_candidate_shows_of_its_stamps_is_not_taken_over_by_the_next(simulation: Simulation) -> None:
+    finder = finder_of(replace(simulation.observation, response=None, covariance=None))
+    (group,) = finder.starts(4, None, None)
+    (candidate,) = finder.quick(group)
+    once, again = finder.polish(candidate), finder.polish(candidate)
+    assert once.stamp_error != 1.0
+    assert np.array_equal(once.values, again.values)

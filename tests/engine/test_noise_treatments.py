@@ -82,7 +82,7 @@ def test_noise_alone_has_the_chi2_and_the_scatter_of_its_covariance_only(observe
 def test_an_inversion_of_drizzled_noise_has_chi2_one_with_the_covariance_and_not_with_the_diagonal(
     observed: Observed,
 ) -> None:
-    model, rng = SourceModel((16, 16), "curvature", 0.5), np.random.default_rng(4)
+    model, rng = SourceModel((16, 16)), np.random.default_rng(4)
     names = ("diagonal", "covariance")
     first = observed.problems["diagonal"].operator
     strength = find_strength(first, observed.lens, model).ln_lambda

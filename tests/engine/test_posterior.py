@@ -234,7 +234,7 @@ def test_a_walker_that_is_stuck_lengthens_the_autocorrelation_time() -> None:
 
 def test_the_strength_that_maximises_the_evidence_is_found() -> None:
     operator = Case(amplitudes=1).operator()
-    target = Target(operator, wide_prior(LENS, 0.0, shear=True), SourceModel((9, 9)))
+    target = Target(operator, wide_prior(LENS, shear=True), SourceModel((9, 9)))
     best = optimal_strength(target, LENS)
     values = [target(target.vector(LENS, best + step)) for step in (-0.3, 0.0, 0.3)]
     assert values[1] > max(values[0], values[2])
@@ -242,14 +242,14 @@ def test_the_strength_that_maximises_the_evidence_is_found() -> None:
 
 def test_a_strength_without_a_maximum_is_refused() -> None:
     operator = Case(amplitudes=1).operator()
-    target = Target(operator, wide_prior(LENS, 0.0, shear=True), SourceModel((9, 9)))
+    target = Target(operator, wide_prior(LENS, shear=True), SourceModel((9, 9)))
     best = optimal_strength(target, LENS)
     with pytest.raises(PosteriorError, match="ln lambda"):
         optimal_strength(target, LENS, low=best + 3.0, high=best + 9.0)
 
 
 def test_outside_the_prior_nothing_is_evaluated() -> None:
-    target = Target(Case().operator(), wide_prior(LENS, 0.0, shear=True), SourceModel((6, 6)))
+    target = Target(Case().operator(), wide_prior(LENS, shear=True), SourceModel((6, 6)))
     outside = target.vector(LENS, 0.0)
     outside[1] = 1.2
     assert target(outside) == -math.inf
@@ -260,7 +260,7 @@ def test_outside_the_prior_nothing_is_evaluated() -> None:
 
 def test_a_lens_without_shear_has_no_shear_parameters() -> None:
     plain = LENS.with_values(gamma1=0.0, gamma2=0.0)
-    prior = wide_prior(plain, 0.0, shear=False)
+    prior = wide_prior(plain, shear=False)
     assert prior.names == ("theta_E", "q", "phi", "slope", "x", "y", "ln_lambda")
     target = Target(Case().operator(), prior, SourceModel((6, 6)))
     assert target.lens(target.vector(plain, 0.0)) == plain

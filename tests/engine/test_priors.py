@@ -62,7 +62,7 @@ def test_positions_prefer_the_lens_that_made_them() -> None:
 
 def test_the_target_is_evidence_prior_and_positions() -> None:
     operator, source = Case(amplitudes=1).operator(), SourceModel((9, 9))
-    prior = wide_prior(LENS, 0.0, shear=False).restricted({"slope": ParameterPrior(mean=2.0, sd=0.1)})
+    prior = wide_prior(LENS, shear=False).restricted({"slope": ParameterPrior(mean=2.0, sd=0.1)})
     positions = AgnPositions(np.array([[1.0, 0.3], [-0.9, -0.2]]), 0.01)
     values = Target(operator, prior, source).vector(LENS, 0.5)
     bare = ln_evidence(operator, LENS, 0.5, source)
@@ -72,7 +72,7 @@ def test_the_target_is_evidence_prior_and_positions() -> None:
 
 
 def test_a_prior_replaces_bounds_and_an_angle_is_one_modulo_pi() -> None:
-    wide = wide_prior(LENS, 0.0, shear=False)
+    wide = wide_prior(LENS, shear=False)
     narrow = wide.restricted(
         {"q": ParameterPrior(low=0.6), "phi": ParameterPrior(low=0.5 + 2 * math.pi, high=0.7 + 2 * math.pi)}
     )
@@ -101,7 +101,7 @@ def test_a_prior_that_says_nothing_or_nonsense_is_refused(document: dict[str, ob
 
 
 def test_a_prior_of_what_the_model_has_not_is_refused() -> None:
-    wide = wide_prior(LENS, 0.0, shear=False)
+    wide = wide_prior(LENS, shear=False)
     with pytest.raises(SpecError, match="gamma1"):
         wide.restricted({"gamma1": ParameterPrior(low=0.0)})
     with pytest.raises(SpecError, match=r"priors\.q"):

@@ -10,12 +10,12 @@ from engine.conventions import rate_to_magnitude
 from engine.inversion.evidence import invert
 from engine.inversion.mapping import SourceGrid
 from engine.inversion.regularisation import SourceModel
+from engine.light.cell_means import columns_on_grid, profile_of, profile_on_grid, shape_of
 from engine.light.sersic import SersicProfile, flux_in_circle, surface_brightness
 from engine.refits.aperture import aperture_flux
 from engine.refits.draws import DrawSet, SourceDraw, source_draw
 from engine.refits.estimators import Refit, SersicFit, refit_draws
 from engine.refits.least_squares import fit_shapes, scatter
-from engine.refits.profiles import columns_on_grid, profile_of, profile_on_grid, shape_of
 from engine.refits.projected import ProjectedMetric
 from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import EstimatorName

@@ -163,7 +163,6 @@ def test_the_profile_paper_is_the_paper_where_it_states_its_settings() -> None:
     assert analysis.regularisation == "curvature"
     assert analysis.draws == 30
     assert not analysis.source_envelope
-    assert analysis.source_softening is None
     assert analysis.noise_treatment == "diagonal"
 
 

@@ -38,8 +38,8 @@ WHOLE: dict[str, Any] = {
     "noise_level": "author", "mass_model": "recommended", "camera": CAMERA,
     "optics": {"defocus_nm": 5.0, "jitter": 0.01}, "seed": 3, "replicates": 2,
     "analysis": {
-        "profile": "draft", "source_pixels": [20, 20], "source_softening": 0.1, "regularisation": "matern",
-        "regularisation_length": 3.0, "noise_treatment": "diagonal", "mask_inner": 0.4, "mask_outer": 1.6,
+        "profile": "draft", "source_pixels": [20, 20], "regularisation": "gradient",
+        "noise_treatment": "diagonal", "mask_inner": 0.4, "mask_outer": 1.6,
         "core_radius": 0.2, "subrays": 2, "source_envelope": True, "ray_margin": 4, "psf_radius": 15, "walkers": 8,
         "chain_length": 100.0, "max_steps": 600, "draws": 30, "agn_position_sd": 0.01, "background_sd": 0.1,
         "priors": {"slope": {"low": 1.5, "high": 2.5, "mean": 2.0, "sd": 0.1}},
