@@ -108,10 +108,16 @@ class StagePayload(_Strict):
 
 
 class ArtefactPayload(_Strict):
-    """Where an artefact lies: its key in the store and the SHA-256 of its bytes."""
+    """Where an artefact lies: its key in the store, which is made of the SHA-256 of its bytes, and that digest."""
 
-    key: Annotated[str, Field(max_length=200, pattern=_PLAIN)]
+    key: Annotated[str, Field(pattern=r"^[0-9a-f]{2}/[0-9a-f]{64}\.[a-z0-9]{1,8}$")]
     digest: Digest
+
+    @model_validator(mode="after")
+    def _named_by_digest(self) -> ArtefactPayload:
+        if not self.key.startswith(f"{self.digest[:2]}/{self.digest}."):
+            raise ValueError(f"the key {self.key} is not that of the digest")
+        return self
 
 
 class ResultPayload(_Strict):

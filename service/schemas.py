@@ -45,6 +45,8 @@ class Problem(_Answer):
     status: int
     detail: str | None = None
     instance: str | None = None
+    artefact: str | None = None
+    """Key of the artefact that cannot be given."""
     errors: list[Place] = Field(default_factory=list)
 
 
@@ -379,6 +381,8 @@ class Readiness(_Answer):
     status: Literal["ready", "degraded"]
     database: Literal["ok"] = "ok"
     dispatcher: Literal["ok", "missing"]
+    artefacts: Literal["ok", "away"] = "ok"
+    """``away``: the store takes nothing, and the dispatcher claims nothing until it does."""
     workers: int
     """Worker threads that runs are given to."""
     engines: dict[str, int]

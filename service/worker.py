@@ -13,6 +13,7 @@ import os
 import sys
 import time
 import traceback
+from base64 import b64encode
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from service import logs
-from service.artefacts import ArtefactStore
+from service.artefacts import ArtefactStore, keeping
 from service.payload import ArtefactPayload, result_payload
 
 if TYPE_CHECKING:
@@ -50,12 +51,15 @@ def call_tasks(
 def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     """Run the task called ``module:function`` and answer ``{"payload": ...}`` or ``{"error": ...}``.
 
-    A payload comes with the digest of the engine that this process has loaded.
+    A payload comes with the digest of the engine that this process has loaded, and with the artefacts that the store
+    did not take (base64, by their keys): it is the dispatcher that waits for the store, not a worker.
     """
     try:
         module, _, name = task.partition(":")
-        payload = getattr(import_module(module), name)(spec, artefact_url)
-        return {"payload": payload, "engine": _engine()}
+        with keeping() as kept:
+            payload = getattr(import_module(module), name)(spec, artefact_url)
+        answer = {"payload": payload, "engine": _engine()}
+        return answer | ({"artefacts": {key: b64encode(data).decode() for key, data in kept.items()}} if kept else {})
     except Exception as error:  # noqa: BLE001 - whatever went wrong must go home as data; the dispatcher decides
         _LOG.warning("the run failed on the worker", exc_info=error)
         return {

@@ -9,7 +9,7 @@ from typing import Any
 from fastapi import Depends, FastAPI
 
 from service import VERSION
-from service.api import catalogue, events, grids, health, problems
+from service.api import artefacts, catalogue, events, grids, health, problems
 from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
@@ -73,6 +73,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     # Last added is outermost: refused bodies are requests too.
     app.add_middleware(Measured, metrics=context.metrics)
     problems.install(app)
+    artefacts.install(app)
     for room in (grids, events, catalogue, health):
         app.include_router(room.router)
     return app

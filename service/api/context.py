@@ -33,7 +33,7 @@ class Context:
         self.probed = Database(settings.database, pooled=False)
         self.leadership = Leadership(self.probed, settings.leader_ttl_s)
         self.metrics = ApiMetrics(self.database, self.leadership)
-        self.artefacts = ArtefactStore(settings.artefacts)
+        self.artefacts = ArtefactStore(settings.artefacts, patience_s=10.0)
 
 
 async def _context(request: Request) -> Context:

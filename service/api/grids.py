@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from pydantic_core import to_json
 
 from engine import engine_digest
+from service.api.artefacts import artefact
 from service.api.bodies import JsonRoute
 from service.api.context import GridId, Limit, RunId, Service
 from service.api.pages import next_link
@@ -141,12 +142,9 @@ def show_run(run_id: RunId, service: Service) -> RunDetail:
 
 @router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]
 @patient
-def figure(run_id: RunId, service: Service) -> Response:
-    """Observation, model, normalised residual, source against truth, as PNG."""
+def figure(run_id: RunId, service: Service, if_none_match: Annotated[str | None, Header()] = None) -> Response:
+    """Observation, model, normalised residual, source against truth, as PNG; 410 or 500 where it is gone or damaged."""
     found = service.grids.run(run_id).result
     if found is None or found.figure is None:
         raise NotFoundError(f"run {run_id} has no figure")
-    try:
-        return Response(service.artefacts.read(found.figure), media_type="image/png")
-    except FileNotFoundError as error:
-        raise NotFoundError(f"the figure of run {run_id} is no longer in the artefact store") from error
+    return artefact(service.artefacts, found.figure, "image/png", if_none_match)

@@ -25,7 +25,7 @@ async def healthz() -> Health:
 
 @router.get("/readyz")
 async def readyz(service: Service) -> Readiness:
-    """Database, dispatcher and workers; ``degraded`` where nothing computes.
+    """Database, dispatcher, artefact store and workers; ``degraded`` where nothing computes.
 
     503 where the database is away or its schema is not the one that this code was written for.
     """
@@ -35,9 +35,11 @@ async def readyz(service: Service) -> Readiness:
         detail = f"the database did not answer within {_DATABASE_S:g} s"
         raise HTTPException(503, detail, headers={"Retry-After": "5"}) from error
     workers = 0 if leader is None else leader.workers
+    artefacts_away = leader is not None and leader.artefacts_away
     return Readiness(
-        status="ready" if workers else "degraded",
+        status="ready" if workers and not artefacts_away else "degraded",
         dispatcher="missing" if leader is None else "ok",
+        artefacts="away" if artefacts_away else "ok",
         workers=workers,
         engines={} if leader is None else leader.engines,
         beat_at=None if leader is None else leader.beat_at,

@@ -58,6 +58,7 @@ def problem(
     detail: str | None = None,
     errors: list[Place] | None = None,
     headers: dict[str, str] | None = None,
+    artefact: str | None = None,
 ) -> Response:
     """The answer to a request that failed."""
     body = Problem(
@@ -65,6 +66,7 @@ def problem(
         status=status,
         detail=detail and _printable(detail),
         instance=None if request is None else _instance(request),
+        artefact=artefact,
         errors=errors or [],
     )
     document = body.model_dump(mode="json", by_alias=True, exclude_none=True)

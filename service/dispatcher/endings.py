@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import traceback
+from base64 import b64decode
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,6 +56,31 @@ def _read_error(error: Any) -> Failure:
     return Failure(Outcome.ERROR, clean(error["code"], 64), clean(error.get("message", "")), retries)
 
 
+def read_artefacts(payload: ResultPayload, answers: Any, place: int) -> dict[str, bytes]:
+    """The artefacts of a payload that came home with it because the store did not take them, by their keys.
+
+    Raises
+    ------
+    service.payload.InvalidResultError
+        They are not what the payload names.
+    """
+    brought = answers[place].get("artefacts", {})
+    if not isinstance(brought, dict):
+        raise InvalidResultError("artefacts: they are not named by their keys")
+    artefacts = {}
+    for named in (payload.figure, payload.products):
+        if named is None or named.key not in brought:
+            continue
+        try:
+            data = b64decode(brought[named.key], validate=True)
+        except (TypeError, ValueError) as error:
+            raise InvalidResultError(f"artefacts: {named.key} is not base64") from error
+        if hashlib.sha256(data).hexdigest() != named.digest:
+            raise InvalidResultError(f"artefacts: {named.key} is not what the payload names")
+        artefacts[named.key] = data
+    return artefacts
+
+
 def read_exception(error: BaseException) -> Failure:
     """What Dask's own failure to run a run means for it."""
     # Not str(error): that calls code of whatever library raised it, which may raise itself.
@@ -70,6 +97,16 @@ def worker_lost() -> Failure:
 def overdue(deadline_s: float) -> Failure:
     """A run that took longer than it may."""
     return Failure(Outcome.DEADLINE, "deadline", f"not done within {deadline_s:g} s", DEADLINE_RETRIES)
+
+
+def refused_artefact(reason: str) -> Failure:
+    """A run one of whose artefacts the store refuses while it takes others: to run it again would change nothing."""
+    return Failure(Outcome.ERROR, "artefact_refused", clean(reason), retries=0)
+
+
+def lost_artefact(reason: str) -> Failure:
+    """A run one of whose artefacts was lost while it waited for the store."""
+    return Failure(Outcome.ERROR, "artefact_lost", clean(reason), ERROR_RETRIES)
 
 
 def unstorable(error: BaseException) -> Failure:

@@ -19,12 +19,14 @@ _LOG = logging.getLogger(__name__)
 class Heartbeat:
     """Beats for one generation until it is stopped; ``lost`` is set once another leads.
 
-    ``engines`` is what it tells: worker threads of each engine by its digest. It is replaced, never changed.
+    ``engines`` is what it tells: worker threads of each engine by its digest. It is replaced, never changed. So is
+    ``artefacts_away``: that the dispatcher waits for the artefact store.
     """
 
     def __init__(self, settings: Settings, generation: int) -> None:
         self.lost = threading.Event()
         self.engines: dict[str, int] = {}
+        self.artefacts_away = False
         self._settings = settings
         self._generation = generation
         self._stop = threading.Event()
@@ -43,11 +45,11 @@ class Heartbeat:
         logs.bind(generation=self._generation)
         database = Database(self._settings.database, pooled=False)
         leadership = Leadership(database, self._settings.leader_ttl_s)
-        told: dict[str, int] | None = None
+        told: tuple[dict[str, int], bool] | None = None
         while not self._stop.is_set():
             try:
-                told = self.engines
-                if not leadership.beat(self._generation, told):
+                told = (self.engines, self.artefacts_away)
+                if not leadership.beat(self._generation, *told):
                     _LOG.error("another dispatcher leads")
                     self.lost.set()
                     return
@@ -61,8 +63,9 @@ class Heartbeat:
             self._wait(told)
         database.close()
 
-    def _wait(self, told: dict[str, int] | None) -> None:
-        """Sleep for a beat, or less where the workers change: readiness should not lag behind it."""
+    def _wait(self, told: tuple[dict[str, int], bool] | None) -> None:
+        """Sleep for a beat, or less where what it tells changes: readiness should not lag behind it."""
         until = time.monotonic() + self._settings.heartbeat_s
-        while time.monotonic() < until and self.engines == told and not self._stop.wait(0.2):
-            pass
+        while time.monotonic() < until and not self._stop.wait(0.2):
+            if told != (self.engines, self.artefacts_away):
+                return

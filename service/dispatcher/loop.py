@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -18,10 +19,12 @@ from distributed import KilledWorker
 from sqlalchemy.exc import SQLAlchemyError
 
 from service import logs
+from service.artefacts import ArtefactStore
 from service.dispatcher.ahead import Ahead
 from service.dispatcher.attribution import Deaths
-from service.dispatcher.endings import OtherEngine, overdue, read_exception, read_part, worker_lost
+from service.dispatcher.endings import OtherEngine, overdue, read_artefacts, read_exception, read_part, worker_lost
 from service.dispatcher.heartbeat import Heartbeat
+from service.dispatcher.holding import PATIENCE_S, Holding, NoRoomError
 from service.dispatcher.metrics import DispatcherMetrics
 from service.dispatcher.placement import Slots
 from service.dispatcher.pool import Pool, Worker, is_lost
@@ -70,7 +73,8 @@ class Dispatcher:
     """One leader's work, from its first claim until it stops, on one pool of workers after another.
 
     Endings (results and failures) wait in a line until the database has them: while one cannot be written nothing
-    is claimed, and no result is dropped because the database was away.
+    is claimed, and no result is dropped because the database was away. Nor because the artefact store was: results
+    whose artefacts it did not take are held until it does.
     """
 
     def __init__(
@@ -103,6 +107,7 @@ class Dispatcher:
         self._due: dict[str, float] = {}
         self._metrics = metrics or DispatcherMetrics()
         self._endings = Writer(queue, self._metrics)
+        self._holding = Holding(ArtefactStore(settings.artefacts, PATIENCE_S), Path(settings.scratch), self._metrics)
         self._metrics.in_flight.set_function(lambda: len(self._flights))
         self._metrics.worker_threads.set_function(lambda: sum(self._heartbeat.engines.values()))
 
@@ -134,7 +139,10 @@ class Dispatcher:
         """Write what has ended, give the rest back to the queue, uncharged; without the database both wait."""
         waiting = self._ahead.take_where(lambda _: True)
         self._collect(0.001)
+        self._attend()
         gone = [flight.lease for flight in (*self._flights.values(), *self._deaths.take_back())]
+        if outcome is Outcome.HANDED_BACK:
+            gone += self._holding.take_where(lambda _: True)  # what is held needs no workers, only this process
         self._flights.clear()
         self._slots.clear()
         self._give_back([*gone, *waiting], outcome)
@@ -171,6 +179,7 @@ class Dispatcher:
             self._due[f"again {what}"] = time.monotonic() + _AGAIN_S
 
     def _step(self) -> None:
+        self._attend()
         self._endings.write()
         workers = self._pool.workers()
         self._tell(workers)
@@ -194,6 +203,7 @@ class Dispatcher:
 
     def _land_and_write(self) -> None:
         self._collect(0.1)
+        self._attend()
         self._look_for_deaths()
         self._endings.write()
 
@@ -203,6 +213,7 @@ class Dispatcher:
             engines[worker.engine] += worker.threads
         if engines != self._heartbeat.engines:
             self._heartbeat.engines = dict(engines)
+        self._heartbeat.artefacts_away = self._holding.away is not None
 
     def _fill(self, workers: list[Worker]) -> None:
         """Claim and place as many runs as there is room for, a suspect first."""
@@ -257,6 +268,8 @@ class Dispatcher:
 
     def _room(self) -> int:
         """How many more runs may be claimed, whatever the workers have room for."""
+        if self._holding.away is not None:
+            return 0
         window = self._settings.window
         return max((window or _NO_WINDOW) - len(self._flights) - len(self._ahead), 0)
 
@@ -345,21 +358,48 @@ class Dispatcher:
     def _end(self, flight: Flight, answers: Any, results: list[tuple[Lease, ResultPayload]]) -> None:
         lease = flight.lease
         ending: ResultPayload | Failure | OtherEngine
+        artefacts: dict[str, bytes] = {}
         try:
             broken = isinstance(answers, BaseException)
             ending = read_exception(answers) if broken else read_part(lease, answers, flight.place)
+            if isinstance(ending, ResultPayload):
+                artefacts = read_artefacts(ending, answers, flight.place)
         except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
             ending = read_exception(error)
         if isinstance(ending, Failure):
-            told = {**logs.fields_of(lease), "code": ending.code}
-            _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, ending.detail, extra=told)
-            self._endings.fail(lease, ending)
+            self._fail(lease, ending)
         elif isinstance(ending, OtherEngine):
             told = logs.fields_of(lease)
             _LOG.warning("run %s, attempt %d: engine %s", lease.run_id, lease.attempt, ending.digest, extra=told)
             self._endings.refuse_engine(lease, ending.digest)
+        elif artefacts:
+            self._hold(lease, ending, artefacts)
         else:
             results.append((lease, ending))
+
+    def _fail(self, lease: Lease, failure: Failure) -> None:
+        told = {**logs.fields_of(lease), "code": failure.code}
+        _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, failure.detail, extra=told)
+        self._endings.fail(lease, failure)
+
+    def _hold(self, lease: Lease, payload: ResultPayload, artefacts: dict[str, bytes]) -> None:
+        """Keep a result until the artefact store takes what came with it; without room for it the run goes back."""
+        try:
+            self._holding.add(lease, payload, artefacts)
+        except NoRoomError as error:
+            detail = f"the artefact store is away and no more results can be kept: {error}"
+            _LOG.warning("run %s goes back: %s", lease.run_id, detail, extra=logs.fields_of(lease))
+            self._endings.lose(lease, detail)
+
+    def _attend(self) -> None:
+        """Turn results that wait no more for the artefact store into endings."""
+        results: list[tuple[Lease, ResultPayload]] = []
+        for lease, ending in self._holding.attend():
+            if isinstance(ending, Failure):
+                self._fail(lease, ending)
+            else:
+                results.append((lease, ending))
+        self._endings.store(results)
 
     def _bury(self, address: str) -> None:
         """A worker died with what it was at."""
@@ -412,12 +452,13 @@ class Dispatcher:
 
     def _look(self) -> None:
         """End what has been cancelled, and give back what waits for a worker while its grid is paused."""
-        if self._flights or len(self._ahead):
+        if self._flights or len(self._ahead) or self._holding.leases:
             cancelled = self._queue.to_cancel(self._generation)
             # Out of our hands before the database is asked again: should it be away, nothing of it is started for that.
             # What comes back from a worker now belongs to no flight, and its lease ends with the next write.
             stopped = self._take_flights(lambda lease: lease.pair in cancelled)
             waiting = self._ahead.take_where(lambda lease: lease.pair in cancelled)
+            waiting += self._holding.take_where(lambda lease: lease.pair in cancelled)
             for lease in [*(flight.lease for flight in stopped), *waiting]:
                 self._endings.cancel(lease)
             self._stop_workers_of(stopped)
@@ -462,14 +503,16 @@ class Dispatcher:
             self._give_back(self._ahead.take_engines_but(carried), Outcome.FORGOTTEN)
         self._endings.write()
         self._drop_ended(self._queue.held(self._generation))
-        known = [flight.lease.pair for flight in (*self._flights.values(), *self._deaths.waiting)]
-        self._queue.requeue_forgotten(self._generation, [*known, *(lease.pair for lease in self._ahead)])
+        known = [flight.lease for flight in (*self._flights.values(), *self._deaths.waiting)]
+        known += [*self._ahead, *self._holding.leases]
+        self._queue.requeue_forgotten(self._generation, [lease.pair for lease in known])
         self._queue.release_postdated()
 
     def _drop_ended(self, held: set[Pair]) -> None:
         """Stop working at runs whose leases have ended without us; what came of them would be dropped."""
         dropped = self._take_flights(lambda lease: lease.pair not in held)
         waiting = self._ahead.take_where(lambda lease: lease.pair not in held)
+        waiting += self._holding.take_where(lambda lease: lease.pair not in held)
         for lease in [*(flight.lease for flight in dropped), *waiting]:
             told = logs.fields_of(lease)
             _LOG.warning("run %s, attempt %d: its lease has ended", lease.run_id, lease.attempt, extra=told)

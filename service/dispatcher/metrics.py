@@ -46,6 +46,10 @@ class DispatcherMetrics:
         self.refusals = self._counter(
             "database_refusals", "What the database refused for what it is: ends of runs, steps of the loop", "what"
         )
+        self.artefact_store_up = self._gauge("artefact_store_up", "0 while the artefact store takes nothing")
+        self.artefact_store_errors = self._counter("artefact_store_errors", "Refusals of the artefact store")
+        self.artefacts_brought = self._counter("artefacts_brought", "Artefacts that workers could not put there")
+        self.results_held = self._gauge("results_held", "Results that wait for the artefact store")
         self.transactions = self._histogram(
             "queue_transaction_duration_seconds", "Transactions of the queue by what they do", _TRANSACTION_S, "what"
         )

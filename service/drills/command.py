@@ -23,6 +23,7 @@ from service.drills.remote import TwoWorkers
 from service.drills.requests import Cancel, Idempotency
 from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from service.drills.scale import Overhead, Throughput
+from service.drills.stores import StoreAway
 from service.drills.volume import Listing, Submission
 from service.drills.workers import Lifetime, SilentWorker
 
@@ -35,6 +36,7 @@ DRILLS: dict[str, type[Drill]] = {
         PostgresKills,
         SqliteLock,
         DiskFull,
+        StoreAway,
         StoppedWorker,
         SilentWorker,
         Lifetime,

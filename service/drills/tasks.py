@@ -99,6 +99,16 @@ def brief(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     return payload
 
 
+def pictured(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
+    """Like brief, with a figure and products of its own, 20 kB each: no other run has written them before."""
+    payload = brief(spec, artefact_url)
+    dice = random.Random(payload["realization_digest"])  # noqa: S311 - dice, not keys
+    store = ArtefactStore(artefact_url)
+    for name, suffix in (("figure", "png"), ("products", "npz")):
+        payload[name] = store.put(PNG + dice.randbytes(20_000), suffix).model_dump()
+    return payload
+
+
 def busy(spec: dict[str, Any], _artefact_url: str) -> dict[str, Any]:
     """A run that computes: as much of a core as brief sleeps, counted in CPU time, whatever else runs beside it."""
     payload = synthetic_payload(spec)

@@ -34,6 +34,8 @@ class LeaderView:
     engines: dict[str, int]
     beat_at: datetime
     expires_at: datetime
+    artefacts_away: bool = False
+    """It waits for the artefact store, and claims nothing meanwhile."""
 
     @property
     def resigned(self) -> bool:
@@ -96,7 +98,9 @@ def leader_view(connection: Connection, *, lock: bool = False) -> LeaderView | N
     row = connection.execute(wanted.with_for_update() if lock else wanted).one_or_none()
     if row is None:
         return None
-    return LeaderView(row.generation, row.holder, row.workers, row.engines, row.beat_at, row.expires_at)
+    return LeaderView(
+        row.generation, row.holder, row.workers, row.engines, row.beat_at, row.expires_at, row.artefacts_away
+    )
 
 
 class Leadership:
@@ -145,7 +149,7 @@ class Leadership:
         with self._database.write() as connection:
             found = leader_view(connection, lock=True)
             values = {
-                "holder": holder, "workers": 0, "engines": {}, "beat_at": now,
+                "holder": holder, "workers": 0, "engines": {}, "artefacts_away": False, "beat_at": now,
                 "expires_at": now + timedelta(seconds=self._ttl_s),
             }  # fmt: skip
             if found is None:
@@ -168,15 +172,24 @@ class Leadership:
         """The database was away: nobody could beat, and nothing is known of the leader."""
         self._rival.forget()
 
-    def beat(self, generation: int, engines: dict[str, int]) -> bool:
-        """Say that the leader lives and how many worker threads it has of each engine; False once another leads."""
+    def beat(self, generation: int, engines: dict[str, int], artefacts_away: bool = False) -> bool:
+        """Say that the leader lives, how many worker threads it has of each engine, and whether it waits for artefacts.
+
+        False once another leads.
+        """
         now = self._clock()
         expires_at = now + timedelta(seconds=self._ttl_s)
         with self._database.write() as connection:
             beaten = connection.execute(
                 update(leader)
                 .where(leader.c.id == 1, leader.c.generation == generation)
-                .values(workers=sum(engines.values()), engines=engines, beat_at=now, expires_at=expires_at)
+                .values(
+                    workers=sum(engines.values()),
+                    engines=engines,
+                    artefacts_away=artefacts_away,
+                    beat_at=now,
+                    expires_at=expires_at,
+                )
             )
             return beaten.rowcount == 1
 

@@ -30,7 +30,7 @@ from sqlalchemy.types import TypeEngine
 
 from service.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
 
-REVISION = "0006"
+REVISION = "0007"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -338,6 +338,7 @@ leader = Table(
     Column("holder", String(200), nullable=False),
     Column("workers", Integer, nullable=False),
     Column("engines", JSON, nullable=False, server_default=text("'{}'")),
+    Column("artefacts_away", Boolean, nullable=False, server_default=false()),
     Column("beat_at", UtcDateTime, nullable=False),
     Column("expires_at", UtcDateTime, nullable=False),
     CheckConstraint("id = 1", name="single_row"),

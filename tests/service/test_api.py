@@ -208,7 +208,8 @@ def test_the_catalogue_is_shown(api: TestClient) -> None:
 def test_readiness_tells_what_is_missing(api: TestClient, settings: Settings) -> None:
     assert api.get("/healthz").json() == {"status": "ok"}
     assert api.get("/readyz").json() == {
-        "status": "degraded", "database": "ok", "dispatcher": "missing", "workers": 0, "engines": {}, "beat_at": None,
+        "status": "degraded", "database": "ok", "dispatcher": "missing", "artefacts": "ok",
+        "workers": 0, "engines": {}, "beat_at": None,
     }  # fmt: skip
     database = Database(settings.database)
     leadership = Leadership(database)

@@ -35,7 +35,8 @@ from tests.service.plans import body, planned
 class Answered:
     """A Dask future that has its answer already, or never gets one."""
 
-    def __init__(self, leases: Sequence[Lease], status: str) -> None:
+    def __init__(self, leases: Sequence[Lease], status: str, task: str = "tests.service.tasks:fast") -> None:
+        self._task = task
         self.key = leases[0].key
         self.status = status
         self._specs = [lease.spec for lease in leases]
@@ -49,7 +50,7 @@ class Answered:
 
     def answer(self, folder: Path) -> None:
         """It has run."""
-        self._answers = call_tasks("tests.service.tasks:fast", self._specs, str(folder))
+        self._answers = call_tasks(self._task, self._specs, str(folder))
         self.status = "finished"
 
     def kill(self) -> None:
@@ -80,6 +81,7 @@ class InstantPool:
     """Runs everything at once in this thread; ``statuses`` makes the first runs end otherwise."""
 
     running = True
+    task = "tests.service.tasks:fast"
 
     def __init__(self, folder: Path, *statuses: str, threads: int = 1) -> None:
         self.folder = folder
@@ -103,7 +105,7 @@ class InstantPool:
         self.submitted += [lease.run_id for lease in leases]
         self.placed += [(worker.address, lease) for lease in leases]
         self.batches.append(len(leases))
-        future = Answered(leases, self.statuses.pop(0) if self.statuses else "finished")
+        future = Answered(leases, self.statuses.pop(0) if self.statuses else "finished", self.task)
         if future.status == "finished":
             future.answer(self.folder)
         self.futures.append(future)
@@ -168,7 +170,7 @@ class Setting:
         assert generation == 1
         self.pool = pool
         self.heartbeat: Any = SimpleNamespace(engines={}, lost=Event())
-        chosen = Settings(poll_s=0.01, **settings)
+        chosen = Settings(poll_s=0.01, data_dir=pool.folder, **settings)
         self.dispatcher = Dispatcher(chosen, self.queue, self.heartbeat, generation)
         self.dispatcher._deaths = Deaths(judge_after_s=0.05)
 

@@ -22,6 +22,7 @@ from service.drills.report import Report, quantile
 from service.drills.requests import Cancel, Idempotency
 from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from service.drills.scale import Overhead, Throughput
+from service.drills.stores import StoreAway
 from service.drills.volume import Listing, Submission
 from service.drills.workers import Lifetime, SilentWorker
 from service.store.database import Database
@@ -52,6 +53,7 @@ def _is_at(process: psutil.Process, folder: Path) -> bool:
         pytest.param(PostgresKills(runs=40, every_s=1.5), marks=pytest.mark.postgres),
         SqliteLock(runs=8, lock_s=2.0),
         DiskFull(runs=8, full_s=1.5),
+        StoreAway(runs=12, away_s=2.0),
         StoppedWorker(runs=6, deadline_s=3.0),
         SilentWorker(runs=6),
         Lifetime(runs=40, lifetime_s=2.0),
