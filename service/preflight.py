@@ -82,7 +82,8 @@ def require_cluster(settings: Settings) -> None:
     if kind == "local":
         _require_task(settings.task)
         try:
-            multiprocessing.get_context("forkserver").Lock()
+            # Of this context, or Python would start a process beside this one that cleans up after it.
+            multiprocessing.get_context("fork").Lock()
         except OSError as error:
             raise ConfigurationError(
                 f"HOSTLENS_CLUSTER: local workers need POSIX semaphores, so a /dev/shm that can be written ({error})"
@@ -149,9 +150,9 @@ def for_both(settings: Settings) -> None:
     """What the processes of one machine need together."""
     if settings.metrics_port == settings.port:
         raise ConfigurationError(f"HOSTLENS_METRICS_PORT and HOSTLENS_PORT are both {settings.port}: they must differ")
-    for_api(settings)
-    require_free(settings.host, settings.port, API_PORT)
+    # First the data folder, which is made: the URL of the database may name a file in it. The API needs nothing more.
     for_dispatcher(settings)
+    require_free(settings.host, settings.port, API_PORT)
 
 
 @contextmanager

@@ -132,7 +132,7 @@ class Settings(LogSettings):
     worker_lifetime_s: Seconds | None = None
     """A worker older than this is started anew once it is idle, each at its own time within a fifth of it."""
     worker_ttl_s: Annotated[float, Field(ge=10.0, le=86400.0)] = 60.0
-    """A local worker that says nothing for so long is started anew."""
+    """A worker that says nothing for so long is started anew."""
 
     metrics_host: Host = "127.0.0.1"
     metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None
@@ -207,8 +207,8 @@ class Settings(LogSettings):
         return str((self.data_dir / "dask").absolute())
 
     def make_folders(self) -> None:
-        """Create the data folder; OSError where that is not allowed."""
-        self.data_dir.mkdir(parents=True, exist_ok=True)
+        """Create the data folder, for nobody else to look into; OSError where that is not allowed."""
+        self.data_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
 
 
 def bracketed(host: str) -> str:

@@ -1,7 +1,6 @@
 """What runs on a Dask worker: one realization through the engine, its figure and arrays into the artefact store.
 
-A worker sees no database. It answers with data only, errors included: an exception of a library that the dispatcher
-has not installed would not unpickle there.
+A worker sees no database. It answers with bytes of JSON only, errors included: see :mod:`service.answers`.
 """
 
 from __future__ import annotations
@@ -16,11 +15,13 @@ import traceback
 from base64 import b64encode
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import psutil
+
 from service import logs
+from service.answers import LIMIT_BYTES, RUNNING, to_bytes
 from service.artefacts import ArtefactStore, keeping
 from service.payload import ArtefactPayload, result_payload
 
@@ -28,24 +29,47 @@ if TYPE_CHECKING:
     from engine import RunResult
 
 _LOG = logging.getLogger(__name__)
+_running: list[None] = []
+"""As long as what this process is at: Dask takes a task for executed that waits for a thread which never comes."""
 _FIRST_COLD = "parametric"
 """Stage of the engine before which a warm-up ends: nearly all that is slow the first time is in the one before."""
 
 
 def call_tasks(
     task: str, specs: Sequence[dict[str, Any]], artefact_url: str, fields: Sequence[logs.Fields] = ()
-) -> list[dict[str, Any]]:
-    """Run the task for one specification after the other; their answers in the same order.
+) -> bytes:
+    """Run the task for one specification after the other; :class:`service.answers.Answers`, in the same order.
 
     The dispatcher submits this function, so that it need not import the engine itself. Short runs come several at a
     time: what Dask does for each task would take longer than they do. ``fields``, if given, has for each specification
     what goes on every line that is logged meanwhile.
     """
     answers = []
-    for place, spec in enumerate(specs):
-        with logs.bound(**(fields[place] if fields else {})):
-            answers.append(call_task(task, spec, artefact_url))
-    return answers
+    _running.append(None)
+    try:
+        for place, spec in enumerate(specs):
+            with logs.bound(**(fields[place] if fields else {})):
+                answers.append(_plain(call_task(task, spec, artefact_url)))
+    finally:
+        _running.pop()
+    return b'{"answers":[%b],"memory":%d}' % (b",".join(answers), _memory())
+
+
+def _plain(answer: dict[str, Any]) -> bytes:
+    """An answer as bytes; where that cannot be, one that says so."""
+    try:
+        data = to_bytes(answer)
+        if len(data) <= LIMIT_BYTES:
+            return data
+        wrong = f"the result has {len(data)} bytes, allowed are {LIMIT_BYTES}"
+    except Exception as error:  # noqa: BLE001 - what the task answered may be anything, and so may what it raises
+        wrong = f"the result is not plain data: {type(error).__name__}"
+    return to_bytes({"error": {"code": "invalid_result", "message": wrong, "permanent": True}})
+
+
+def _memory() -> int:
+    """Memory of this process [bytes]."""
+    return int(psutil.Process().memory_info().rss)
 
 
 def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
@@ -60,7 +84,7 @@ def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, A
             payload = getattr(import_module(module), name)(spec, artefact_url)
         answer = {"payload": payload, "engine": _engine()}
         return answer | ({"artefacts": {key: b64encode(data).decode() for key, data in kept.items()}} if kept else {})
-    except Exception as error:  # noqa: BLE001 - whatever went wrong must go home as data; the dispatcher decides
+    except BaseException as error:  # noqa: BLE001 - whatever went wrong must go home as data; the dispatcher decides
         _LOG.warning("the run failed on the worker", exc_info=error)
         return {
             "error": {
@@ -71,17 +95,10 @@ def call_task(task: str, spec: dict[str, Any], artefact_url: str) -> dict[str, A
         }
 
 
-@dataclass(frozen=True)
-class Greeting:
-    """What a worker says before its first run: digest of its engine, its threads by library, seconds to get warm."""
-
-    engine: str
-    threads: dict[str, int]
-    warm_s: float
-
-
-def greet(task: str) -> Greeting:
+def greet(task: str) -> bytes:
     """Make a worker ready: one thread for every numeric library, and the task's module loaded and warm.
+
+    What comes back is a :class:`service.answers.Greeting`.
 
     A module says by a function ``warm_up`` how it gets warm. Workers that were started elsewhere have seldom been
     told how many threads to use, so it is set here, as far as what is loaded already lets it.
@@ -92,7 +109,23 @@ def greet(task: str) -> Greeting:
     module = import_module(task.partition(":")[0])
     engine = _engine()
     getattr(module, "warm_up", lambda: None)()
-    return Greeting(engine, _one_thread(), time.perf_counter() - began)
+    threads = _one_thread()
+    warm_s = time.perf_counter() - began
+    said = {"engine": engine, "threads": threads, "warm_s": warm_s, "pid": os.getpid(), "memory": _memory()}
+    return to_bytes({**said, **_join()})
+
+
+def _join() -> dict[str, Any]:
+    """Have Dask's heartbeats tell what is run here; what memory Dask lets this worker use. Nothing where it is none."""
+    from distributed import get_worker
+
+    try:
+        worker = get_worker()
+    except ValueError:
+        return {}
+    worker.metrics[RUNNING] = lambda _: len(_running)
+    rules = worker.memory_manager
+    return {"memory_limit": rules.memory_limit, "pause_fraction": rules.memory_pause_fraction or None}
 
 
 def _one_thread() -> dict[str, int]:
@@ -176,18 +209,19 @@ def _products(result: RunResult, artefacts: ArtefactStore) -> ArtefactPayload | 
     return artefacts.put(data.getvalue(), "npz")
 
 
-def _is_permanent(error: Exception) -> bool:
+def _is_permanent(error: BaseException) -> bool:
     """Whether another attempt cannot help: the engine gives the same answer, errors included, to the same spec."""
     # By name, because importing the engine's errors would load the engine where the task is not the engine's.
     names = {kind.__name__ for kind in type(error).__mro__}
     return not names.isdisjoint({"EngineError", "InvalidResultError"})
 
 
-def _error_code(error: Exception) -> str:
+def _error_code(error: BaseException) -> str:
     names = {kind.__name__ for kind in type(error).__mro__}
     codes = {
         "InvalidResultError": "invalid_result",
         "SpecError": "invalid_spec",
         "EngineError": "engine_error",
+        "MemoryError": "memory",
     }
     return next((code for name, code in codes.items() if name in names), "error")

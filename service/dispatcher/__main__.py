@@ -6,18 +6,17 @@ import sys
 
 from service import start
 
-# Dask's workers import this module again when they are started; only the process itself dispatches.
 if __name__ == "__main__":
     start.begin()
     # Until everything is loaded; dispatch() turns it on again.
     gc.disable()
     # Asked for in plain, because to load what reads settings takes a tenth of the time that workers wait for.
-    from service.dispatcher.nursery import close_nursery, open_nursery
+    from service.dispatcher.host import end_prepared, prepare_host
 
-    start.on_early_end(close_nursery)
+    start.on_early_end(end_prepared)
     if os.environ.get("HOSTLENS_CLUSTER", "local") == "local" and "HOSTLENS_SCHEDULER_ADDRESS" not in os.environ:
-        # Before all else, so that it loads while this process does; without this, dispatch() opens it.
-        open_nursery()
+        # Before all else, so that it loads while this process does; without this, dispatch() starts it.
+        prepare_host()
     from service.dispatcher.process import dispatch
     from service.settings import read_settings
 
@@ -25,4 +24,4 @@ if __name__ == "__main__":
         with start.refusing():
             sys.exit(dispatch(read_settings()))
     finally:
-        close_nursery()
+        end_prepared()

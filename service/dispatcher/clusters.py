@@ -6,20 +6,31 @@ Slurm and Kubernetes need the extras of that name; nothing of them is imported o
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import dask
 from distributed import Client, LocalCluster, Security
 
+from service.dispatcher.host import take_host
 from service.dispatcher.nursery import ONE_THREAD
+from service.dispatcher.plain import only_plain_data
 from service.settings import Settings
 
 _OUR_RULES = {
     "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
     "DASK_DISTRIBUTED__SCHEDULER__WORK_STEALING": "false",
 }
+_LOCAL_RULES = {
+    # From the nursery.
+    "distributed.worker.multiprocessing-method": "forkserver",
+    # Dask's own pages have no TLS, and tell every user of the machine who asks what runs here.
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
+_CREDENTIALS = ("require_encryption", "tls_ca_file", "tls_client_cert", "tls_client_key")
 _CONNECT_S = 5  # a stop has to wait for it
 _STOP_S = 5.0
 
@@ -34,6 +45,13 @@ def dask_config(settings: Settings) -> dict[str, Any]:
         # Dask pins all of these but NUMBA_NUM_THREADS by itself.
         "distributed.nanny.pre-spawn-environ": ONE_THREAD,
         "distributed.worker.daemon": True,
+        # Said here whatever a configuration file of Dask's says. What we keep on a worker is a few bytes, so there is
+        # nothing to spill. Beyond 80 % a worker takes no further run: the one it is at may still end, and what it
+        # leaves behind is judged in `stalls`. Beyond 95 % its nanny ends it, before the kernel ends anything else.
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": 0.8,
+        "distributed.worker.memory.terminate": 0.95,
         # Workers write the lines that the service writes, with the run on them.
         "distributed.worker.preload": ["service.logs"],
         "distributed.comm.timeouts.connect": "10s",
@@ -50,23 +68,40 @@ def dask_config(settings: Settings) -> dict[str, Any]:
 
 @contextmanager
 def open_client(settings: Settings) -> Iterator[Any]:
-    """A client of the workers that the settings ask for; OSError where a scheduler elsewhere does not answer."""
+    """A client of the workers that the settings ask for; OSError where the scheduler does not answer.
+
+    While it is open nothing is unpickled in this process.
+    """
+    with ExitStack() as closing:
+        closing.enter_context(dask.config.set(dask_config(settings)))
+        closing.enter_context(only_plain_data())
+        address, security = settings.scheduler_address, security_of(settings)
+        if settings.kind_of_cluster != "address":
+            host = take_host(settings.kind_of_cluster)
+            closing.callback(host.close)
+            found = host.start_cluster(settings)
+            address, security = found["address"], found["security"] and Security(**found["security"])
+        client = Client(address, timeout=f"{_CONNECT_S} s", set_as_default=False, security=security)
+        with client:
+            # By value, so that the scheduler need not have this package: it only schedules.
+            client.run_on_scheduler(_first_death_is_ours())
+            yield client
+
+
+@contextmanager
+def start_cluster(settings: Settings) -> Iterator[dict[str, Any]]:
+    """A cluster that lives as long as the context; where its scheduler is, and what it takes to speak to it."""
     with dask.config.set(dask_config(settings)):
-        if settings.kind_of_cluster == "address":
-            security = security_of(settings)
-            address = settings.scheduler_address
-            with Client(address, timeout=f"{_CONNECT_S} s", set_as_default=False, security=security) as client:
-                # By value, so that the scheduler need not have this package: it only schedules.
-                client.run_on_scheduler(_first_death_is_ours())
-                yield client
-            return
         if settings.kind_of_cluster == "local":
-            # From the nursery, which the process that dispatches has opened.
-            dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
-        cluster = _CLUSTERS[settings.kind_of_cluster](settings)
+            dask.config.set(_LOCAL_RULES)
+        Path(settings.scratch).mkdir(mode=0o700, parents=True, exist_ok=True)
+        security = Security.temporary() if settings.kind_of_cluster == "local" else None
+        cluster = _CLUSTERS[settings.kind_of_cluster](settings, security)
         try:
-            with Client(cluster, set_as_default=False) as client:
-                yield client
+            yield {
+                "address": cluster.scheduler_address,
+                "security": security and {name: getattr(security, name) for name in _CREDENTIALS},
+            }
         finally:
             cluster.close(timeout=_STOP_S)
 
@@ -90,8 +125,9 @@ def _first_death_is_ours() -> Any:
     return rule
 
 
-def _local(settings: Settings) -> Any:
+def _local(settings: Settings, security: Security | None) -> Any:
     return LocalCluster(
+        security=security,
         n_workers=settings.workers,
         threads_per_worker=1,
         processes=True,
@@ -155,4 +191,8 @@ def kubernetes(settings: Settings) -> Any:
     return KubeCluster(namespace=settings.kubernetes_namespace, custom_cluster_spec=kubernetes_spec(settings))
 
 
-_CLUSTERS = {"local": _local, "slurm": slurm, "kubernetes": kubernetes}
+_CLUSTERS: dict[str, Callable[[Settings, Any], Any]] = {
+    "local": _local,
+    "slurm": lambda settings, _: slurm(settings),
+    "kubernetes": lambda settings, _: kubernetes(settings),
+}

@@ -8,6 +8,7 @@ from base64 import b64decode
 from dataclasses import dataclass
 from typing import Any
 
+from service.answers import NotPlainError
 from service.payload import InvalidResultError, ResultPayload, read_payload
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
@@ -82,7 +83,9 @@ def read_artefacts(payload: ResultPayload, answers: Any, place: int) -> dict[str
 
 
 def read_exception(error: BaseException) -> Failure:
-    """What Dask's own failure to run a run means for it."""
+    """What Dask's own failure to run a run means for it, or an answer that is not plain data."""
+    if isinstance(error, NotPlainError):
+        return _invalid(str(error))
     # Not str(error): that calls code of whatever library raised it, which may raise itself.
     text = clean("".join(traceback.format_exception_only(error)).strip())
     return Failure(Outcome.ERROR, "task_error", text, ERROR_RETRIES)
@@ -92,6 +95,12 @@ def worker_lost() -> Failure:
     """A run that was alone on a worker when that died."""
     text = "the worker died while it ran this"
     return Failure(Outcome.WORKER_LOST, "worker_lost", text, WORKER_LOST_RETRIES, suspect=True)
+
+
+def memory_exceeded(reached: int, limit: int) -> Failure:
+    """A run that needs more memory than its worker has."""
+    text = f"it took {reached / 2**20:.0f} MiB of a worker that has {limit / 2**20:.0f} MiB"
+    return Failure(Outcome.WORKER_LOST, "memory", text, WORKER_LOST_RETRIES, suspect=True)
 
 
 def overdue(deadline_s: float) -> Failure:

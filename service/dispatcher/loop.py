@@ -7,10 +7,9 @@ import math
 import queue as queues
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -21,12 +20,14 @@ from sqlalchemy.exc import SQLAlchemyError
 from service import logs
 from service.artefacts import ArtefactStore
 from service.dispatcher.ahead import Ahead
-from service.dispatcher.attribution import Deaths
-from service.dispatcher.endings import OtherEngine, overdue, read_artefacts, read_exception, read_part, worker_lost
+from service.dispatcher.blame import Blame
+from service.dispatcher.endings import OtherEngine, overdue, read_artefacts, read_exception, read_part
+from service.dispatcher.flight import GATHER_S, Flight
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.holding import PATIENCE_S, Holding, NoRoomError
 from service.dispatcher.metrics import DispatcherMetrics
 from service.dispatcher.placement import Slots
+from service.dispatcher.plain import read_error
 from service.dispatcher.pool import Pool, Worker, is_lost
 from service.dispatcher.writer import Writer
 from service.payload import ResultPayload
@@ -37,7 +38,6 @@ from service.store.leases import Lease, Outcome, Pair
 from service.store.queue import Failure, RunQueue
 
 _LOG = logging.getLogger(__name__)
-_FETCH_S, _GATHER_S = 1.0, 30.0
 _LOOK_S = 1.0
 _SURE_S = 5.0
 """A look at what has been cancelled is good for so long; without a newer one nothing that waits is started."""
@@ -48,25 +48,6 @@ _GONE_S = 1.0
 _NO_WINDOW = 1_000_000
 _BRIEF_S = 10.0
 """Where runs take less, the next are claimed before a worker is free: it waits 30 ms for the database otherwise."""
-
-
-@dataclass
-class Flight:
-    """A run on a worker: at ``place`` of the answers of a Dask task, where ``beside`` others are too."""
-
-    lease: Lease
-    worker: str
-    engine: str
-    future: Any
-    place: int
-    beside: int
-    started: float
-    missed: float | None = None
-    """Since when its worker has been gone."""
-    answered: bool = False
-    """Whether it has come to its end on its worker, which may be at the next run while the answer is fetched."""
-    patience_s: float = _FETCH_S
-    """How long the next look waits for the answer."""
 
 
 class Dispatcher:
@@ -92,7 +73,6 @@ class Dispatcher:
         self._pool: Pool
         self._flights: dict[str, Flight] = {}
         self._done: queues.SimpleQueue[str] = queues.SimpleQueue()
-        self._deaths: Deaths[Flight] = Deaths()
         self._slots = Slots(settings.worker_lifetime_s)
         self._ahead = Ahead()
         self._brief: set[str] = set()
@@ -107,6 +87,7 @@ class Dispatcher:
         self._due: dict[str, float] = {}
         self._metrics = metrics or DispatcherMetrics()
         self._endings = Writer(queue, self._metrics)
+        self._blame = Blame(self._endings)
         self._holding = Holding(ArtefactStore(settings.artefacts, PATIENCE_S), Path(settings.scratch), self._metrics)
         self._metrics.in_flight.set_function(lambda: len(self._flights))
         self._metrics.worker_threads.set_function(lambda: sum(self._heartbeat.engines.values()))
@@ -140,7 +121,7 @@ class Dispatcher:
         waiting = self._ahead.take_where(lambda _: True)
         self._collect(0.001)
         self._attend()
-        gone = [flight.lease for flight in (*self._flights.values(), *self._deaths.take_back())]
+        gone = [flight.lease for flight in (*self._flights.values(), *self._blame.deaths.take_back())]
         if outcome is Outcome.HANDED_BACK:
             gone += self._holding.take_where(lambda _: True)  # what is held needs no workers, only this process
         self._flights.clear()
@@ -191,6 +172,7 @@ class Dispatcher:
         busy = bool(workers) and not self._slots.free(workers)
         self._collect(_LOOK_S if busy else self._settings.poll_s)
         self._look_for_deaths()
+        self._replace_stalled()
         self._endings.write()
         if self._is_due("reconcile", self._settings.reconcile_s):
             self._try("reconcile", self._reconcile)
@@ -214,6 +196,7 @@ class Dispatcher:
         if engines != self._heartbeat.engines:
             self._heartbeat.engines = dict(engines)
         self._heartbeat.artefacts_away = self._holding.away is not None
+        self._metrics.workers_unfit.set(len(self._pool.present() or ()) - len(workers))
 
     def _fill(self, workers: list[Worker]) -> None:
         """Claim and place as many runs as there is room for, a suspect first."""
@@ -283,7 +266,7 @@ class Dispatcher:
             now = time.monotonic()
             for place, lease in enumerate(batch):
                 self._flights[lease.key] = Flight(
-                    lease, worker.address, worker.engine, future, place, len(batch) - 1, now
+                    lease, worker.address, worker.engine, worker.memory, future, place, len(batch) - 1, now
                 )
             future.add_done_callback(lambda done: self._done.put(done.key))
 
@@ -320,13 +303,14 @@ class Dispatcher:
         future, answers = flights[0].future, None
         error: BaseException | None = None
         if future.status == "error":
-            error = future.exception(timeout=_GATHER_S)
+            error = read_error(future.exception(timeout=GATHER_S))
             if isinstance(error, KilledWorker):
                 self._bury(flights[0].worker)
                 return
         else:
             try:
-                answers = self._fetch(flights[0])
+                said = flights[0].fetch()
+                answers, flights[0].memory.latest = said.answers, said.memory
             except (OSError, TimeoutError, CancelledError):
                 return  # the worker went before its answer was fetched: a later look finds out what is left
             except Exception as broken:  # noqa: BLE001 - the answer came from another process and may be anything
@@ -337,23 +321,13 @@ class Dispatcher:
             self._brief.discard(flights[0].engine)
         for flight in flights:
             self._remove(flight.lease.key)
+        if error is not None:
+            flights[0].memory.latest = None  # nobody said what it left behind
         if error is not None and len(flights) > 1:
-            self._suspect(flights, f"one of {len(flights)} runs may be the cause: {read_exception(error).detail}")
+            self._blame.suspect(flights, f"one of {len(flights)} runs may be the cause: {read_exception(error).detail}")
             return
         for flight in flights:
             self._end(flight, answers if error is None else error, results)
-
-    def _fetch(self, flight: Flight) -> Any:
-        """The answers of a Dask task that has ended; TimeoutError where they do not come for now.
-
-        Dask waits on for a worker that never returns, and everything else would wait with it: hence a short wait, and
-        a longer one at each later look, for a large answer over a slow line.
-        """
-        try:
-            return flight.future.result(timeout=flight.patience_s)
-        except TimeoutError:
-            flight.patience_s = min(2.0 * flight.patience_s, _GATHER_S)
-            raise
 
     def _end(self, flight: Flight, answers: Any, results: list[tuple[Lease, ResultPayload]]) -> None:
         lease = flight.lease
@@ -389,7 +363,7 @@ class Dispatcher:
         except NoRoomError as error:
             detail = f"the artefact store is away and no more results can be kept: {error}"
             _LOG.warning("run %s goes back: %s", lease.run_id, detail, extra=logs.fields_of(lease))
-            self._endings.lose(lease, detail)
+            self._endings.lose(lease, detail, Outcome.HANDED_BACK)
 
     def _attend(self) -> None:
         """Turn results that wait no more for the artefact store into endings."""
@@ -404,17 +378,19 @@ class Dispatcher:
     def _bury(self, address: str) -> None:
         """A worker died with what it was at."""
         self._pool.forget(address)
-        flights = [self._remove(key) for key, flight in list(self._flights.items()) if flight.worker == address]
+        flights = self._take_flights(lambda flight: flight.worker == address)
         if self._pool.was_stopped(address) or self._pool.closed_on_purpose(address):
-            self._lose(flights, "the worker was stopped")
+            self._blame.lose(flights, "the worker was stopped")
             return
         self._metrics.worker_deaths.inc()
         answered = [flight for flight in flights if flight.answered]
         under_way = [flight for flight in flights if not flight.answered]
         _LOG.warning("worker %s died with %d runs", address, len(under_way))
         # What had ended did not kill it, only its answer is lost.
-        self._lose(answered, "the worker died before its answer was fetched")
-        self._deaths.add(under_way, time.monotonic())
+        self._blame.lose(answered, "the worker died before its answer was fetched")
+        for flight in answered:
+            flight.memory.latest = None
+        self._blame.deaths.add(under_way, time.monotonic())
 
     def _look_for_deaths(self) -> None:
         """Judge the dead, and give back what is on workers that are gone without Dask having blamed anyone."""
@@ -428,27 +404,23 @@ class Dispatcher:
                     flight.missed = now
                 elif now - flight.missed > _GONE_S and not flight.future.done():
                     # Long enough for Dask to have said that the worker died with this run, if it had.
-                    self._lose([self._remove(key)], "the worker is gone")
+                    self._blame.lose([self._remove(key)], "the worker is gone")
                     flight.future.cancel()
-        verdict = self._deaths.judge(time.monotonic())
-        if verdict is None:
-            return
-        if verdict.guilty is not None:
-            self._endings.fail(verdict.guilty.lease, worker_lost())
-        if verdict.suspects:
-            self._suspect(verdict.suspects, f"one of {len(verdict.suspects)} runs may have killed a worker")
+        self._blame.judge(self._pool)
 
-    def _suspect(self, flights: Sequence[Flight], detail: str) -> None:
-        """Runs one of which is to blame go back uncharged, to be tried one at a time."""
-        self._endings.suspect([flight.lease for flight in flights], detail)
-
-    def _lose(self, flights: Iterable[Flight], detail: str) -> None:
-        """Runs that are not to blame go back uncharged."""
-        for flight in flights:
-            lease = flight.lease
-            told = logs.fields_of(lease)
-            _LOG.info("run %s, attempt %d goes back: %s", lease.run_id, lease.attempt, detail, extra=told)
-            self._endings.lose(lease, detail)
+    def _replace_stalled(self) -> None:
+        """Start workers anew that are alive and take no work; what had been sent there goes back."""
+        busy: dict[str, float] = {}
+        for flight in self._flights.values():
+            busy[flight.worker] = min(busy.get(flight.worker, flight.started), flight.started)
+        stopped: dict[str, list[Flight]] = {}
+        for stall in self._pool.stalled(busy):
+            flights = self._take_flights(lambda flight, address=stall.address: flight.worker == address)  # type: ignore[misc]
+            self._metrics.workers_replaced.labels(stall.reason).inc()
+            _LOG.warning("worker %s is alive and takes no work, so it is replaced: %s", stall.address, stall.reason)
+            self._blame.replaced(stall, flights)
+            stopped[stall.address] = flights
+        self._pool.stop(stopped, [flight.future for flights in stopped.values() for flight in flights])
 
     def _look(self) -> None:
         """End what has been cancelled, and give back what waits for a worker while its grid is paused."""
@@ -456,7 +428,7 @@ class Dispatcher:
             cancelled = self._queue.to_cancel(self._generation)
             # Out of our hands before the database is asked again: should it be away, nothing of it is started for that.
             # What comes back from a worker now belongs to no flight, and its lease ends with the next write.
-            stopped = self._take_flights(lambda lease: lease.pair in cancelled)
+            stopped = self._take_flights(lambda flight: flight.lease.pair in cancelled)
             waiting = self._ahead.take_where(lambda lease: lease.pair in cancelled)
             waiting += self._holding.take_where(lambda lease: lease.pair in cancelled)
             for lease in [*(flight.lease for flight in stopped), *waiting]:
@@ -468,8 +440,8 @@ class Dispatcher:
         self._looked = time.monotonic()
         self._endings.write()
 
-    def _take_flights(self, wanted: Callable[[Lease], bool]) -> list[Flight]:
-        return [self._remove(key) for key, flight in list(self._flights.items()) if wanted(flight.lease)]
+    def _take_flights(self, wanted: Callable[[Flight], bool]) -> list[Flight]:
+        return [self._remove(key) for key, flight in list(self._flights.items()) if wanted(flight)]
 
     def _stop_workers_of(self, flights: list[Flight]) -> None:
         """End what no longer has a lease; runs beside it on the same worker go back when the worker is gone."""
@@ -485,13 +457,13 @@ class Dispatcher:
         overdue_flights = []
         for key, flight in list(self._flights.items()):
             if stranded or is_lost(flight.future):
-                self._lose([self._remove(key)], "no workers" if stranded else "unknown to Dask")
+                self._blame.lose([self._remove(key)], "no workers" if stranded else "unknown to Dask")
                 flight.future.cancel()
             elif now - flight.started > self._settings.deadline_s:
                 ending = overdue(self._settings.deadline_s)
                 overdue_flights.append(self._remove(key))
                 if flight.beside:
-                    self._suspect([flight], f"one of {flight.beside + 1} runs was {ending.detail}")
+                    self._blame.suspect([flight], f"one of {flight.beside + 1} runs was {ending.detail}")
                 else:
                     self._endings.fail(flight.lease, ending)
             elif flight.future.done():
@@ -503,14 +475,14 @@ class Dispatcher:
             self._give_back(self._ahead.take_engines_but(carried), Outcome.FORGOTTEN)
         self._endings.write()
         self._drop_ended(self._queue.held(self._generation))
-        known = [flight.lease for flight in (*self._flights.values(), *self._deaths.waiting)]
+        known = [flight.lease for flight in (*self._flights.values(), *self._blame.deaths.waiting)]
         known += [*self._ahead, *self._holding.leases]
         self._queue.requeue_forgotten(self._generation, [lease.pair for lease in known])
         self._queue.release_postdated()
 
     def _drop_ended(self, held: set[Pair]) -> None:
         """Stop working at runs whose leases have ended without us; what came of them would be dropped."""
-        dropped = self._take_flights(lambda lease: lease.pair not in held)
+        dropped = self._take_flights(lambda flight: flight.lease.pair not in held)
         waiting = self._ahead.take_where(lambda lease: lease.pair not in held)
         waiting += self._holding.take_where(lambda lease: lease.pair not in held)
         for lease in [*(flight.lease for flight in dropped), *waiting]:

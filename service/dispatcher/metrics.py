@@ -17,6 +17,7 @@ from prometheus_client import (
 )
 
 from service import logs
+from service.dispatcher.stalls import REASONS
 from service.payload import ResultPayload
 from service.settings import ConfigurationError, Settings
 from service.store.database import AWAY
@@ -38,6 +39,10 @@ class DispatcherMetrics:
         self.in_flight = self._gauge("runs_in_flight", "Runs that Dask has been given and that have not ended")
         self.worker_threads = self._gauge("worker_threads", "Worker threads that are connected")
         self.worker_deaths = self._counter("worker_deaths", "Worker processes that died while they had a run")
+        self.workers_unfit = self._gauge("workers_unfit", "Workers that are connected and get no runs")
+        self.workers_replaced = self._counter(
+            "workers_replaced", "Workers that were alive and took no work, by why", "reason"
+        )
         self.claimed = self._counter("runs_claimed", "Runs taken from the queue")
         self.ended = self._counter("runs_ended", "Runs that ended for good, by their state", "state")
         self.requeued = self._counter("runs_requeued", "Attempts that gave the run back, by their outcome", "reason")
@@ -59,11 +64,13 @@ class DispatcherMetrics:
         self.run_duration = self._histogram("run_duration_seconds", "Wall time of stored runs on their worker", _RUN_S)
         ProcessCollector(registry=self.registry)
         # A series that appears with the first event hides that event from rate().
-        for reason in Outcome:
-            if reason not in {Outcome.DONE, Outcome.CANCELLED, Outcome.REFUSED}:
-                self.requeued.labels(reason)
+        for outcome in Outcome:
+            if outcome not in {Outcome.DONE, Outcome.CANCELLED, Outcome.REFUSED}:
+                self.requeued.labels(outcome)
         for state in (RunState.DONE, RunState.FAILED, RunState.QUARANTINED, RunState.CANCELLED):
             self.ended.labels(state)
+        for reason in REASONS:
+            self.workers_replaced.labels(reason)
         for digest in ("same", "other"):
             self.stale.labels(digest)
         for what in ("ending", "look", "claim", "reconcile", "upkeep"):

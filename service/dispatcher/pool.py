@@ -9,23 +9,29 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from uuid import uuid4
 
 from service import logs
+from service.answers import NotPlainError, read_greeting
 from service.dispatcher.clusters import open_client
+from service.dispatcher.plain import read_error
+from service.dispatcher.stalls import LOOK_S, Asked, Condition, Stall, Stalls, WorkerMemory, read_conditions
 from service.settings import Settings
 from service.store.leases import Lease
-from service.worker import Greeting, call_tasks, greet
+from service.worker import call_tasks, greet
 
 _LOG = logging.getLogger(__name__)
 _STOP_S = 5.0
 _LOOK_EVERY_S, _LOOK_SOON_S = 0.5, 0.1
-_GREET_AGAIN_S = 30.0
+_ASK_S = 10.0
+"""How long the scheduler may take to answer; where it says nothing for longer than ``_GONE_S`` there is none."""
+_GONE_S = 60.0
+_GREET_AGAIN_S, _MAX_GREET_AGAIN_S = 10.0, 300.0
 _STOPPING_S = 20.0
 """How long a worker that was stopped is not used: it is gone by then, or its address belongs to the next one."""
 
@@ -38,6 +44,7 @@ class Worker:
     threads: int
     engine: str
     since: float
+    memory: WorkerMemory = field(default_factory=WorkerMemory, compare=False)
 
 
 class Pool:
@@ -48,16 +55,27 @@ class Pool:
         self._settings = settings
         self._present: dict[str, int] | None = {}
         self._looked = float("-inf")
-        self._greetings: dict[str, Any] = {}
-        self._refused: dict[str, float] = {}
+        self._answered = time.monotonic()
+        self._greetings: dict[str, Asked] = {}
+        self._refused: set[str] = set()
+        self._conditions: dict[str, Condition] = {}
+        self._stalls = Stalls(settings.worker_ttl_s)
+        self._conditions_due = float("-inf")
+        self._unfit: list[tuple[float, Stall]] = []
+        self._failures = 0
+        """Greetings that have failed since one was answered."""
         self._workers: dict[str, Worker] = {}
         self._stopping: dict[str, float] = {}
         self._stopper = ThreadPoolExecutor(1, thread_name_prefix="stopper")
 
     @property
     def running(self) -> bool:
-        """Whether the scheduler is there."""
-        return bool(self._client.status == "running")
+        """Whether the scheduler is there and answers."""
+        if self._present is None and time.monotonic() - self._answered > _GONE_S:
+            return False
+        # The task that listens to the scheduler: it ends where that said what Dask's client cannot read.
+        listens = self._client._handle_report_task
+        return bool(self._client.status == "running" and listens is not None and not listens.done())
 
     def present(self) -> Collection[str] | None:
         """Addresses of all workers that the scheduler knows, as of the last moment; None where it does not answer."""
@@ -69,7 +87,42 @@ class Pool:
         self._look()
         if self._present is None:
             return []
-        return [worker for address, worker in self._workers.items() if address not in self._stopping]
+        return [
+            worker
+            for address, worker in self._workers.items()
+            if address not in self._stopping and self._is_fit(address)
+        ]
+
+    def _is_fit(self, address: str) -> bool:
+        condition = self._conditions.get(address)
+        return condition is None or condition.takes_work
+
+    def stalled(self, busy: Mapping[str, float]) -> list[Stall]:
+        """Workers that take no work and are to be replaced, each once; they get no more runs.
+
+        ``busy`` says since when, on the monotonic clock, each worker that was given runs has had the oldest of them.
+        """
+        now = time.monotonic()
+        if now < self._conditions_due:
+            return []
+        self._conditions_due = now + LOOK_S
+        try:
+            self._conditions = read_conditions(self._ask(self._client.scheduler.identity, n_workers=-1))
+        except (OSError, TimeoutError, NotPlainError):
+            return []
+        self._conditions_due = now + LOOK_S * (1.0 + len(self._conditions) / 100.0)
+        known = {address: found for address, found in self._conditions.items() if address not in self._stopping}
+        refused = [stall for due, stall in self._unfit if due <= now]
+        self._unfit = [(due, stall) for due, stall in self._unfit if due > now]
+        return [*refused, *self._stalls.look(known, busy, now)]
+
+    def memory_kill(self, memory: WorkerMemory) -> int | None:
+        """Memory for which a nanny has ended this worker [bytes], None where it has not."""
+        try:
+            events = self._ask(self._client.scheduler.events, topic="worker-restart-memory")
+            return next((int(said["rss"]) for _, said in reversed(events) if said["pid"] == memory.pid), None)
+        except (OSError, NotPlainError, TypeError, ValueError, KeyError):
+            return None
 
     def submit(self, leases: Sequence[Lease], worker: Worker) -> Any:
         """Start runs, one after the other as one task; the future of their answers, in the same order."""
@@ -81,6 +134,11 @@ class Pool:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""
         wanted, ended = [address for address in addresses if address not in self._stopping], list(futures)
         self._stopping.update(dict.fromkeys(wanted, time.monotonic()))
+        for address in wanted:
+            # The next one may come to the same address, and has to be greeted.
+            self._workers.pop(address, None)
+            self._greetings.pop(address, None)
+            self._refused.discard(address)
         if wanted or ended:
             self._stopper.submit(self._stop, wanted, ended)
 
@@ -96,7 +154,7 @@ class Pool:
         """Whether a worker that is gone was told to go (a signal, the end of its lifetime) and did not die."""
         try:
             events = self._client.get_events(address)
-        except (OSError, TimeoutError):
+        except (OSError, TimeoutError, NotPlainError, RuntimeError):
             return False
         # The next worker may have the same address, where ports are fixed: what counts is the last life that has ended.
         lives: list[list[str]] = [[]]
@@ -111,6 +169,14 @@ class Pool:
     def close(self) -> None:
         """Stop nothing more."""
         self._stopper.shutdown(wait=False, cancel_futures=True)
+
+    def _ask(self, question: Callable[..., Any], **options: Any) -> Any:
+        """An answer of the scheduler; OSError or TimeoutError where none comes."""
+        try:
+            return self._client.sync(question, callback_timeout=_ASK_S, **options)
+        except RuntimeError as error:
+            # Dask's client has closed itself in this moment, because the scheduler is gone.
+            raise OSError(f"the scheduler cannot be asked: {error}") from error
 
     def _on(self, address: str, key: str, function: Callable[..., Any], *arguments: Any) -> Any:
         return self._client.submit(
@@ -131,40 +197,57 @@ class Pool:
         self._looked = now
         try:
             # Not scheduler_info(): the client's own timer overwrites its answer with one that lists no workers.
-            present: dict[str, int] = self._client.nthreads()
-        except (OSError, TimeoutError):
+            present: dict[str, int] = self._ask(self._client.scheduler.ncores, workers=None)
+        except (OSError, TimeoutError, NotPlainError):
             self._present = None
             return
+        passed, self._answered = min(now - self._answered, 1.0), now
         self._present = present
         self._stopping = {at: since for at, since in self._stopping.items() if now - since < _STOPPING_S}
-        for known in (self._workers, self._greetings, self._refused):
+        for address in self._greetings.keys() - present.keys():
+            _LOG.error("worker %s went before it had answered its greeting", address)
+            self._unfit.append((now, Stall(address, "greeting", begun=True, memory=0)))
+        for known in (self._workers, self._greetings):
             for address in known.keys() - present.keys():
                 del known[address]
+        self._refused &= present.keys()
         for address, threads in present.items():
-            if address not in self._workers:
-                self._greet(address, threads, now)
+            if address not in self._workers and address not in self._refused and address not in self._stopping:
+                self._greet(address, threads, now, passed)
 
-    def _greet(self, address: str, threads: int, now: float) -> None:
-        """Ask a new worker what it carries; until it has answered it gets no run."""
-        if address in self._refused and now - self._refused[address] < _GREET_AGAIN_S:
-            return
+    def _greet(self, address: str, threads: int, now: float, passed: float) -> None:
+        """Ask a new worker what it carries; until it has answered it gets no run, and if it does not it is replaced."""
         if address not in self._greetings:
-            self._greetings[address] = self._on(address, f"greet-{uuid4().hex}", greet)
-        future = self._greetings[address]
-        if not future.done():
+            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet), now)
+        asked = self._greetings[address]
+        if not asked.future.done():
+            if asked.has_stalled(self._conditions.get(address), passed, now):
+                self._refuse(address, "it does not answer its greeting")
+            return
+        try:
+            said = read_greeting(asked.future.result(timeout=_STOP_S))
+        except Exception as error:  # noqa: BLE001 - it comes from another process and may be anything
+            self._refuse(address, repr(read_error(error)))
             return
         del self._greetings[address]
-        try:
-            said: Greeting = future.result(timeout=_STOP_S)
-        except Exception as error:  # noqa: BLE001 - it comes from another process and may be anything
-            _LOG.error("worker %s cannot be used: %r", address, error)
-            self._refused[address] = now
-            return
-        self._workers[address] = Worker(address, threads, said.engine, now)
+        self._failures = 0
+        memory = WorkerMemory(said.pid, said.memory, said.memory, said.memory_limit, said.pause_fraction)
+        self._workers[address] = Worker(address, threads, said.engine, now, memory)
         _LOG.info("worker %s: engine %.12s, %s, warm after %.1f s", address, said.engine, said.threads, said.warm_s)
 
+    def _refuse(self, address: str, why: str) -> None:
+        """Do not use a worker that cannot be greeted; it is replaced at the next look at what is stalled."""
+        _LOG.error("worker %s cannot be used: %s", address, why)
+        del self._greetings[address]
+        self._refused.add(address)
+        # The first at once; where none can be greeted, that they are started anew and again is of no use.
+        due = time.monotonic() + min(_GREET_AGAIN_S * self._failures, _MAX_GREET_AGAIN_S)
+        self._failures += 1
+        self._unfit.append((due, Stall(address, "greeting", begun=True, memory=0)))
+
     def _stop(self, addresses: list[str], futures: list[Any]) -> None:
-        with suppress(TimeoutError, OSError):
+        # KeyError: a worker that is gone.
+        with suppress(TimeoutError, OSError, KeyError, NotPlainError):
             if futures:
                 self._client.cancel(futures, force=True)
             if not addresses:
@@ -177,7 +260,8 @@ class Pool:
                 self._client.run(_die, workers=addresses, wait=False)
 
 
-def _die() -> None:
+async def _die() -> None:
+    # A coroutine, since Dask waits for the answer of everything else.
     os._exit(1)
 
 

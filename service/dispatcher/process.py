@@ -14,9 +14,9 @@ from sqlalchemy.exc import DBAPIError
 from service import logs, preflight
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.holder import is_dead, own_name
+from service.dispatcher.host import end_prepared, prepare_host
 from service.dispatcher.loop import Dispatcher
 from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
-from service.dispatcher.nursery import close_nursery, open_nursery
 from service.dispatcher.pool import Pool, open_pool
 from service.process import spare_collector, stop_with_parent
 from service.settings import Settings
@@ -51,7 +51,7 @@ def dispatch(settings: Settings) -> int:
     logging.getLogger("distributed").setLevel(logging.ERROR)
     preflight.for_dispatcher(settings)
     if settings.kind_of_cluster == "local":
-        open_nursery()
+        prepare_host()
     # Each result is a hundred objects, and Dask makes much that it would look through again and again.
     spare_collector()
     metrics = DispatcherMetrics()
@@ -59,7 +59,7 @@ def dispatch(settings: Settings) -> int:
         with metrics.serving(settings):
             return _dispatch(settings, metrics, stop)
     finally:
-        close_nursery()
+        end_prepared()
 
 
 def _dispatch(settings: Settings, metrics: DispatcherMetrics, stop: Event) -> int:

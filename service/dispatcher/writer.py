@@ -63,9 +63,9 @@ class Writer:
         """A run that another engine has answered."""
         self._add([lease], lambda items: self._queue.refuse_engine(items[0][0], engine))
 
-    def lose(self, lease: Lease, detail: str) -> None:
+    def lose(self, lease: Lease, detail: str, outcome: Outcome = Outcome.FORGOTTEN) -> None:
         """A run that went missing through no fault of its own."""
-        self._add([lease], lambda items: self._queue.requeue_lost(items[0][0], Outcome.FORGOTTEN, detail))
+        self._add([lease], lambda items: self._queue.requeue_lost(items[0][0], outcome, detail))
 
     def suspect(self, leases: Iterable[Lease], detail: str) -> None:
         """Runs one of which is to blame."""

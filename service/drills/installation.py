@@ -49,7 +49,7 @@ def eventually(look: Callable[[], T], timeout_s: float = 30.0, what: str = "it")
 
 
 def is_worker(process: psutil.Process) -> bool:
-    """Whether a Dask nanny started this process: on its own, or had it forked from the dispatcher's nursery."""
+    """Whether a Dask nanny started this process: on its own, or had it forked from a nursery."""
     if "--multiprocessing-fork" in process.cmdline():
         return True
     parent = process.parent()

@@ -27,12 +27,11 @@ def _timed_claim(queue: RunQueue, *arguments: Any, **options: Any) -> list[Lease
     return leases
 
 
-# Dask's workers import this module again when they are spawned; only the process itself dispatches.
 if __name__ == "__main__":
     gc.disable()
-    from service.dispatcher.nursery import open_nursery
+    from service.dispatcher.host import prepare_host
     from service.dispatcher.process import dispatch
 
-    open_nursery()
+    prepare_host()
     setattr(RunQueue, "claim", _timed_claim)  # noqa: B010 - mypy refuses the assignment
     sys.exit(dispatch(Settings()))

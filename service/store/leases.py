@@ -48,6 +48,7 @@ class Outcome(StrEnum):
     FORGOTTEN = "forgotten"
     SCHEDULER_LOST = "scheduler_lost"
     REFUSED = "refused"
+    STALLED = "stalled"
 
 
 @dataclass(frozen=True)

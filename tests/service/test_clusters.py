@@ -6,17 +6,20 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import dask.config
 import psutil
 import pytest
 from distributed import Client
 from distributed.batched import BatchedSend
+from distributed.core import Status
 from pydantic import ValidationError
 from sqlalchemy import select
 
@@ -38,13 +41,13 @@ _PATIENCE_S = 150
 class Apart:
     """A scheduler, workers and a dispatcher, each started by its own command as on different machines."""
 
-    def __init__(self, folder: Path, url: str, *, tls: bool) -> None:
+    def __init__(self, folder: Path, url: str, *, tls: bool, **settings: str) -> None:
         self.folder = folder
         self.port = free_port()
         self.executions = folder / "executions"
         self.executions.touch()
         self.processes: list[subprocess.Popen[bytes]] = []
-        settings = {
+        settings = settings | {
             "DATABASE_URL": url,
             "DATA_DIR": str(folder / "data"),
             "SCHEDULER_ADDRESS": f"{'tls' if tls else 'tcp'}://127.0.0.1:{self.port}",
@@ -100,8 +103,8 @@ class Apart:
 
 
 @contextmanager
-def apart(folder: Path, url: str, *, tls: bool) -> Iterator[Apart]:
-    found = Apart(folder, url, tls=tls)
+def apart(folder: Path, url: str, *, tls: bool, **settings: str) -> Iterator[Apart]:
+    found = Apart(folder, url, tls=tls, **settings)
     try:
         yield found
     except BaseException:
@@ -199,6 +202,60 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
         assert outcomes(database)["done"] == 132
         dispatcher.terminate()
         assert dispatcher.wait(timeout=_PATIENCE_S) == 0
+
+
+def test_workers_elsewhere_that_take_no_work_are_replaced_and_nobody_is_charged(
+    tmp_path: Path, sqlite_url: str
+) -> None:
+    with apart(tmp_path, sqlite_url, tls=False, WORKER_TTL_S="10") as cluster, ExitStack() as closing:
+        database = Database(sqlite_url)
+        closing.callback(database.close)
+        grids, leadership = GridStore(database), Leadership(database)
+        cluster.scheduler()
+        workers = [cluster.worker(), cluster.worker("--no-nanny")]
+        cluster.dispatcher()
+        log = cluster.folder / "log"
+
+        def ready(threads: int) -> bool:
+            view = leadership.alive()
+            return view is not None and sum(view.engines.values()) == threads
+
+        def replaced(reason: str) -> int:
+            return log.read_text().count(f"it is replaced: {reason}")
+
+        eventually(lambda: ready(2), _PATIENCE_S, "two greeted workers")
+        client = closing.enter_context(Client(cluster.settings.scheduler_address, set_as_default=False))
+        client.run(_pause)
+        # Told at once, noticed within a minute.
+        eventually(lambda: ready(0), 15, "the news that no worker takes work")
+        eventually(lambda: replaced("paused") == 2, 60, "both being replaced")
+        workers[1].wait(timeout=30)  # without a nanny it ends, and whatever started it starts it again
+        eventually(lambda: ready(1), _PATIENCE_S, "the worker with a nanny")
+
+        for harm, reason in ((_close_and_stay, "closing"), (_let_no_thread_come, "not_started")):
+            client.run(harm)
+            grid = submit(grids, 4, seed=replaced(""))
+            eventually(lambda reason=reason: replaced(reason), 60, reason)
+            eventually(lambda grid=grid: grids.grid(grid).counts.done == 4, _PATIENCE_S, f"the runs after {reason}")
+        (process, *_) = worker_processes(workers[0])
+        process.suspend()
+        eventually(lambda: replaced("silent"), 60, "the silent worker being replaced")
+        eventually(lambda: _is_replaced(workers[0], process.pid) and ready(1), _PATIENCE_S, "another one")
+        # Forgotten: claimed for a worker that was replaced. Nobody is charged.
+        assert set(outcomes(database)) <= {"done", "stalled", "forgotten"}
+        assert outcomes(database)["done"] == 8
+
+
+def _pause(dask_worker: Any) -> None:
+    dask_worker.memory_manager.memory_limit = 1
+
+
+def _close_and_stay(dask_worker: Any) -> None:
+    dask_worker.status = Status.closing_gracefully
+
+
+def _let_no_thread_come(dask_worker: Any) -> None:
+    dask_worker.executors["default"].submit(time.sleep, 3600)
 
 
 def _threads() -> set[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -20,6 +20,7 @@ from service.dispatcher.attribution import Deaths
 from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.loop import Dispatcher
 from service.dispatcher.pool import Pool, Worker
+from service.dispatcher.stalls import Stall, WorkerMemory
 from service.payload import ResultPayload
 from service.settings import Settings
 from service.store.database import Database
@@ -120,6 +121,12 @@ class InstantPool:
     def was_stopped(self, address: str) -> bool:
         return False
 
+    def stalled(self, busy: Mapping[str, float]) -> list[Stall]:
+        return []
+
+    def memory_kill(self, memory: WorkerMemory) -> int | None:
+        return None
+
     def closed_on_purpose(self, address: str) -> bool:
         return False
 
@@ -172,7 +179,7 @@ class Setting:
         self.heartbeat: Any = SimpleNamespace(engines={}, lost=Event())
         chosen = Settings(poll_s=0.01, data_dir=pool.folder, **settings)
         self.dispatcher = Dispatcher(chosen, self.queue, self.heartbeat, generation)
-        self.dispatcher._deaths = Deaths(judge_after_s=0.05)
+        self.dispatcher._blame.deaths = Deaths(judge_after_s=0.05)
 
     def run(self, until: Callable[[], bool] | None = None, steps: int = 200) -> None:
         looks = iter(range(steps))
@@ -588,3 +595,84 @@ def test_a_heartbeat_outlasts_the_database_and_ends_once_another_leads(database:
     assert leadership.take("next", lambda _: True) == 2
     assert heartbeat.lost.wait(10)
     heartbeat.stop()
+
+
+class StallingPool(InstantPool):
+    """A pool one of whose workers takes no work, or was ended by its nanny for its memory."""
+
+    def __init__(self, folder: Path, *statuses: str, threads: int = 1) -> None:
+        super().__init__(folder, *statuses, threads=threads)
+        self.memory = {address: WorkerMemory(1, 200, 200, 1000, 0.8) for address in self.addresses}
+        self.stalls: list[Stall] = []
+        self.killed_at: int | None = None
+
+    def workers(self) -> list[Worker]:
+        return [Worker(worker, self.threads, self.engine, 0.0, self.memory[worker]) for worker in self.addresses]
+
+    def stalled(self, busy: Mapping[str, float]) -> list[Stall]:
+        stalls, self.stalls = self.stalls, []
+        return stalls
+
+    def memory_kill(self, memory: WorkerMemory) -> int | None:
+        return self.killed_at
+
+
+@pytest.mark.parametrize(
+    ("stall", "latest", "first"),
+    [
+        (Stall("a", "paused", begun=True, memory=900), 200, "worker_lost"),
+        (Stall("a", "paused", begun=True, memory=900), 600, "stalled"),
+        (Stall("a", "paused", begun=True, memory=900), None, "stalled"),
+        (Stall("a", "paused", begun=False, memory=900), 200, "stalled"),
+        (Stall("a", "not_started", begun=False, memory=900), 200, "stalled"),
+        (Stall("a", "closing", begun=False, memory=0), 200, "stalled"),
+        (Stall("a", "silent", begun=True, memory=900), 200, "worker_lost"),
+    ],
+)
+def test_of_runs_on_a_worker_that_takes_no_work_only_one_that_filled_it_or_silenced_it_is_charged(
+    database: Database, tmp_path: Path, stall: Stall, latest: int | None, first: str
+) -> None:
+    pool = StallingPool(tmp_path, "pending")
+    pool.memory["a"].latest = latest
+    setting = Setting(database, pool, runs=2)
+    setting.run(until=lambda: len(pool.submitted) == 2)
+    pool.stalls = [stall]
+    setting.run(steps=2000)
+    assert setting.grids.grid(setting.grid_id).counts.done == 2
+    assert outcomes(setting) == [[first, "done"], ["done"]]
+    assert pool.stopped == pool.futures[:1]
+
+
+def test_runs_beside_each_other_on_a_worker_whose_memory_is_full_are_suspects(
+    database: Database, tmp_path: Path
+) -> None:
+    pool = StallingPool(tmp_path, "pending", "pending", threads=2)
+    pool.addresses = ["a"]
+    setting = Setting(database, pool, runs=2)
+    setting.run(until=lambda: len(pool.submitted) == 2)
+    pool.stalls = [Stall("a", "paused", begun=True, memory=900)]
+    setting.run(steps=2000)
+    assert outcomes(setting) == [["suspected", "done"]] * 2
+
+
+@pytest.mark.parametrize(("latest", "outcome"), [(200, "worker_lost"), (600, "stalled")])
+def test_each_of_two_runs_whose_workers_were_ended_for_memory_at_once_answers_for_itself(
+    database: Database, tmp_path: Path, latest: int, outcome: str
+) -> None:
+    pool = StallingPool(tmp_path, "error", "error")
+    pool.killed_at = 950
+    pool.memory["b"].latest = latest
+    setting = Setting(database, pool, runs=2)
+    setting.run(steps=2000)
+    assert outcomes(setting) == [["worker_lost", "done"], [outcome, "done"]]
+
+
+def test_a_run_that_needs_too_much_memory_three_times_is_quarantined_with_that(
+    database: Database, tmp_path: Path
+) -> None:
+    pool = StallingPool(tmp_path, *["error"] * 3)
+    pool.killed_at = 950
+    setting = Setting(database, pool, runs=1)
+    setting.run(steps=2000)
+    (run,) = setting.grids.runs(setting.grid_id, 10).items
+    assert (run.state, run.error and run.error.code, run.attempt) == ("quarantined", "memory", 3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import DataError, IntegrityError, OperationalError, ProgrammingError, StatementError
 
 from engine import engine_digest
+from service.answers import to_bytes
 from service.dispatcher.endings import OtherEngine, read_answer
 from service.payload import InvalidResultError, read_payload
 from service.store.database import Database
@@ -305,7 +307,7 @@ def test_whatever_a_worker_calls_an_error_ends_its_run_on_every_database(
     setting = Setting(database, pool, runs=1)
     setting.run(until=lambda: len(pool.submitted) == 1)
     pool.futures[0].status = "finished"
-    pool.futures[0]._answers = [{"error": error, "engine": engine_digest()}]
+    pool.futures[0]._answers = to_bytes({"answers": [{"error": error, "engine": engine_digest()}]})
     pool.futures[0]._told(pool.futures[0])
     setting.run()
     (found,) = setting.grids.runs(setting.grid_id, 10).items
@@ -382,7 +384,8 @@ def test_suspects_of_two_engines_take_turns_and_neither_clears_the_other_s_lane(
     def noted(leases: Sequence[Lease], worker: Any) -> Any:
         served.append(worker.engine[:1])
         future = submits(leases, worker)
-        future._answers = [{**answer, "engine": worker.engine} for answer in future._answers]
+        answers = [{**answer, "engine": worker.engine} for answer in json.loads(future._answers)["answers"]]
+        future._answers = to_bytes({"answers": answers})
         return future
 
     pool.submit = noted  # type: ignore[method-assign]

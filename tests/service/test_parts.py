@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from distributed import KilledWorker
 from fastapi.testclient import TestClient
 from matplotlib.figure import Figure
 from pydantic import ValidationError
@@ -29,18 +31,20 @@ from engine.result import (
     StageTime,
 )
 from engine.spec import Analysis
+from service.answers import LIMIT_BYTES, NotPlainError, read_answers, to_bytes
 from service.api.app import create_app
 from service.artefacts import ArtefactStore
 from service.cli import app
 from service.dispatcher.endings import OtherEngine, clean, read_answer, read_exception
 from service.dispatcher.holder import is_dead, own_name
+from service.dispatcher.plain import read_error
 from service.identifiers import utc_now
 from service.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
 from service.requests import AnalysisRequest
 from service.settings import Settings
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
-from service.worker import call_task, execute
+from service.worker import call_task, call_tasks, execute
 from tests.service.plans import planned
 from tests.service.tasks import PNG, synthetic_payload
 
@@ -234,10 +238,81 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
 def test_a_worker_is_greeted_with_its_engine_one_thread_and_warm_kernels() -> None:
     """In a process of its own, as a worker started elsewhere is: without any of the variables that pin threads."""
     code = (
-        "from service.worker import greet; said = greet('service.worker:execute'); "
+        "from service.worker import greet; from service.answers import read_greeting; "
+        "said = read_greeting(greet('service.worker:execute')); "
         "print(said.engine, set(said.threads.values()), f'{said.warm_s:.1f}')"
     )
     plain = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
     done = subprocess.run([sys.executable, "-c", code], env=plain, capture_output=True, text=True, check=True)
     print(f"warm after {done.stdout.split()[-1]} s")
     assert done.stdout.split()[:2] == [engine.engine_digest(), "{1}"]
+
+
+def test_answers_of_workers_are_plain_data_of_a_bounded_size_and_nothing_else() -> None:
+    good = {"answers": [{"payload": {}, "engine": "e"}, {"error": {}}], "memory": 7}
+    assert read_answers(to_bytes(good), 2).memory == 7
+    wrong: tuple[object, ...] = (
+        good,
+        to_bytes(good).decode(),
+        pickle.dumps(good),
+        b"",
+        b"[" * 100_000,
+        b'{"answers":[' + b"9" * 10_000 + b"]}",
+        to_bytes({**good, "answers": good["answers"] * 2}),
+        to_bytes({**good, "answers": [1, 2]}),
+        to_bytes({**good, "more": 1}),
+        to_bytes({**good, "memory": -1}),
+        b" " * (3 * LIMIT_BYTES + 1),
+    )
+    for said in wrong:
+        with pytest.raises(NotPlainError):
+            read_answers(said, 2)
+
+
+def test_what_a_task_answers_leaves_the_worker_as_plain_data_or_as_an_error_that_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answers: dict[str, Any] = {"object": object(), "huge": "x" * LIMIT_BYTES, "well": 1}
+    monkeypatch.setattr("tests.service.tasks.fast", lambda spec, _: answers[spec])
+    said = read_answers(call_tasks("tests.service.tasks:fast", list(answers), str(tmp_path)), 3)  # type: ignore[arg-type]
+    assert [answer.get("error", {}).get("code") for answer in said.answers] == ["invalid_result"] * 2 + [None]
+    assert said.memory > 0
+    monkeypatch.setattr("tests.service.tasks.fast", _no_memory)
+    (answer,) = read_answers(call_tasks("tests.service.tasks:fast", [{}], str(tmp_path)), 1).answers
+    assert answer["error"]["code"] == "memory"
+
+
+def _no_memory(*_: Any) -> Any:
+    raise MemoryError
+
+
+def test_an_exception_that_was_not_unpickled_is_told_by_the_text_that_is_in_it() -> None:
+    error = read_error(Exception(pickle.dumps(OSError(28, "no space"))))
+    assert "no space" in str(error)
+    assert isinstance(read_error(Exception(pickle.dumps(KilledWorker("key", None, 0)))), KilledWorker)  # type: ignore[arg-type]
+    assert str(read_error(Exception(b"\x80\x04\xff"))) == "an exception without a text"
+    plain = ValueError("as it is")
+    assert read_error(plain) is plain
+
+
+def test_no_pickle_names_a_class_or_a_function_while_a_client_of_workers_is_open() -> None:
+    code = """
+import os, pickle, sys
+from service.dispatcher.plain import only_plain_data
+class Harm:
+    def __reduce__(self):
+        return os.mkdir, (sys.argv[1],)
+harm, data = pickle.dumps(Harm()), pickle.dumps([1, b"2", {"three": (4.0, None)}])
+with only_plain_data():
+    assert pickle.loads(data) == [1, b"2", {"three": (4.0, None)}]
+    assert pickle.loads(pickle.dumps(bytes)) is bytes
+    for loads in (pickle.loads, pickle._loads):
+        try:
+            loads(harm)
+        except TypeError as error:
+            assert "mkdir" in str(error)
+        else:
+            raise AssertionError
+"""
+    subprocess.run([sys.executable, "-c", code, "harmed"], check=True, cwd=Path(__file__).parents[2])
+    assert not Path("harmed").exists()
