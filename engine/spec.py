@@ -12,7 +12,17 @@ from collections.abc import Mapping
 from itertools import pairwise
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import ConfigDict, Discriminator, Field, Strict, Tag, TypeAdapter, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Strict,
+    Tag,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
@@ -32,31 +42,34 @@ _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 # Strict, or a file's true would be the number 1 and its "20.5" a number. What stands here is the one statement of what
 # is allowed: files, grids and the API's schema are made of these types.
+# A negative zero is read as zero: the two are equal, and JSON would make two digests of them. It stands behind the
+# bounds of every number that can be zero, or the schema would not know them for bounds.
+_UNSIGNED = AfterValidator(lambda number: number + 0.0)
 Number = Annotated[float, Strict()]
 Count = Annotated[int, Strict()]
 Flag = Annotated[bool, Strict()]
 AxisRatio = Annotated[Number, Field(ge=0.05, le=1.0)]
-Angle = Annotated[Number, Field(ge=-360.0, le=360.0)]
+Angle = Annotated[Number, Field(ge=-360.0, le=360.0), _UNSIGNED]
 Magnitude = Annotated[Number, Field(ge=5.0, le=40.0)]
 SersicIndex = Annotated[Number, Field(ge=0.3, le=10.0)]
 Radius = Annotated[Number, Field(gt=1e-4, le=60.0)]
-Coordinate = Annotated[Number, Field(ge=-60.0, le=60.0)]
+Coordinate = Annotated[Number, Field(ge=-60.0, le=60.0), _UNSIGNED]
 Position = tuple[Coordinate, Coordinate]
 Positive = Annotated[Number, Field(gt=0.0, le=1e9)]
-NotNegative = Annotated[Number, Field(ge=0.0, le=1e9)]
-Bound = Annotated[Number, Field(ge=-1e6, le=1e6)]
-PupilCoordinate = Annotated[Number, Field(ge=-2.0, le=2.0)]
-Waves = Annotated[Number, Field(ge=-10.0, le=10.0)]
+NotNegative = Annotated[Number, Field(ge=0.0, le=1e9), _UNSIGNED]
+Bound = Annotated[Number, Field(ge=-1e6, le=1e6), _UNSIGNED]
+PupilCoordinate = Annotated[Number, Field(ge=-2.0, le=2.0), _UNSIGNED]
+Waves = Annotated[Number, Field(ge=-10.0, le=10.0), _UNSIGNED]
 Slope = Annotated[Number, Field(ge=0.2, le=1.8)]
 Seed = Annotated[Count, Field(ge=0, le=2**63 - 1)]
-Fraction = Annotated[Number, Field(ge=0.0, lt=1.0)]
+Fraction = Annotated[Number, Field(ge=0.0, lt=1.0), _UNSIGNED]
 Scale = Annotated[Number, Field(gt=0.0001, le=1.0)]
-Shear = Annotated[Number, Field(ge=-0.7, le=0.7)]
+Shear = Annotated[Number, Field(ge=-0.7, le=0.7), _UNSIGNED]
 Shift = Annotated[Count, Field(ge=-64, le=64)]
 ZernikeTerm = Literal[4, 5, 6, 7, 8, 9, 10, 11, 22]
 KernelRow = tuple[NotNegative, NotNegative, NotNegative]
-RightAscension = Annotated[Number, Field(ge=0.0, lt=360.0)]
-Declination = Annotated[Number, Field(ge=-90.0, le=90.0)]
+RightAscension = Annotated[Number, Field(ge=0.0, lt=360.0), _UNSIGNED]
+Declination = Annotated[Number, Field(ge=-90.0, le=90.0), _UNSIGNED]
 Exposure = Annotated[Number, Field(gt=0.0, le=1e5)]
 Identifier = Annotated[str, Field(min_length=1, max_length=64, pattern=IDENTIFIER)]
 SlopeKey = Annotated[str, Field(pattern=DECIMAL)]
@@ -318,8 +331,8 @@ class Optics:
     about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis].
     """
 
-    defocus_nm: Annotated[Number, Field(ge=-500.0, le=500.0)] = 0.0
-    jitter: Annotated[Number, Field(ge=0.0, le=0.5)] = 0.0
+    defocus_nm: Annotated[Number, Field(ge=-500.0, le=500.0), _UNSIGNED] = 0.0
+    jitter: Annotated[Number, Field(ge=0.0, le=0.5), _UNSIGNED] = 0.0
 
 
 NOMINAL_OPTICS = Optics()
@@ -366,9 +379,9 @@ class Analysis:
     source_pixels: tuple[Annotated[Count, Field(ge=2, le=80)], Annotated[Count, Field(ge=2, le=80)]] = (20, 20)
     regularisation: RegularisationName = "curvature"
     noise_treatment: NoiseTreatment = "covariance"
-    mask_inner: Annotated[Number, Field(ge=0.0, lt=1.0)] = 0.4
+    mask_inner: Annotated[Number, Field(ge=0.0, lt=1.0), _UNSIGNED] = 0.4
     mask_outer: Annotated[Number, Field(gt=1.0, le=5.0)] = 1.65
-    core_radius: Annotated[Number, Field(ge=0.0, le=2.0)] = 0.25
+    core_radius: Annotated[Number, Field(ge=0.0, le=2.0), _UNSIGNED] = 0.25
     subrays: Annotated[Count, Field(ge=1, le=8)] = 2
     source_envelope: Flag = True
     ray_margin: Annotated[Count, Field(ge=0, le=40)] = 4

@@ -6,7 +6,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
-from fastapi import Depends, FastAPI
+from fastapi import Depends, FastAPI, Request
+from fastapi.responses import JSONResponse
 
 from service import VERSION
 from service.api import artefacts, catalogue, events, grids, health, problems
@@ -46,6 +47,10 @@ class _App(FastAPI):
         return self.openapi_schema
 
 
+async def _document(request: Request) -> JSONResponse:
+    return JSONResponse(request.app.openapi())
+
+
 def create_app(settings: Settings | None = None) -> FastAPI:
     """Build the application; the database must have been migrated, and need not be there yet."""
     context = Context(settings or Settings())
@@ -61,6 +66,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="hostlens",
         version=VERSION,
         summary="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
+        # Served below instead: FastAPI's own address would take any parameter.
+        openapi_url=None,
         docs_url=None,
         redoc_url=None,
         lifespan=lifespan,
@@ -73,6 +80,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     # Last added is outermost: refused bodies are requests too.
     app.add_middleware(Measured, metrics=context.metrics)
     problems.install(app)
+    app.add_api_route("/openapi.json", _document, include_in_schema=False)
     artefacts.install(app)
     for room in (grids, events, catalogue, health):
         app.include_router(room.router)

@@ -13,8 +13,9 @@ from engine import SpecError
 from service.api.problems import InvalidRequestError, problem
 
 # As JSON writes them.
-_NUMBERS = {
+_PLAIN = {
     "integer": (re.compile(r"-?(0|[1-9][0-9]*)"), "a whole number in plain digits"),
+    "boolean": (re.compile(r"true|false"), "true or false"),
     "number": (re.compile(r"-?(0|[1-9][0-9]*)(\.[0-9]+)?([eE][-+]?[0-9]+)?"), "a number in plain digits"),
 }
 
@@ -43,7 +44,9 @@ class BodyLimit:
             # What came is not what was announced: no request, and nobody to be told.
             return
         if body is None:
-            answer = problem(Request(scope), 413, f"a body may have {self.max_bytes} bytes")
+            # Nobody reads on to where another request could begin.
+            headers = {"Connection": "close"}
+            answer = problem(Request(scope), 413, f"a body may have {self.max_bytes} bytes", headers=headers)
             await answer(scope, receive, send)
             return
         await self.app(scope, _replay(body, receive), send)
@@ -78,14 +81,15 @@ def _replay(body: bytes, receive: Receive) -> Receive:
 
 
 async def known_parameters(request: Request) -> None:
-    """Refuse query parameters that the endpoint does not document, and what is given twice or is no plain number.
+    """Refuse query parameters that the endpoint does not document, and what is given twice or not as JSON writes it.
 
     A misspelt filter that is ignored would answer with everything, which looks like an answer. Of a header that is
-    given twice FastAPI would take the first, of numbers also ``1_0``, `` 10`` and the digits of any script.
+    given twice FastAPI would take the first, of numbers also ``1_0``, `` 10`` and the digits of any script, and ``yes``
+    for true.
     """
     route = request.scope["route"]
-    operation = request.app.openapi()["paths"][route.path][request.method.lower()]
-    documented = operation.get("parameters", ())
+    operations = request.app.openapi()["paths"].get(route.path, {})
+    documented = operations.get(request.method.lower(), {}).get("parameters", ())
     known = {found["name"]: found["schema"] for found in documented if found["in"] == "query"}
     headers = {found["name"]: found["schema"] for found in documented if found["in"] == "header"}
     for name in request.query_params:
@@ -100,6 +104,6 @@ def _require_one(source: Literal["query", "header"], name: str, values: list[str
     if len(values) > 1:
         raise InvalidRequestError(source, name, "given more than once")
     kinds = {kind.get("type") for kind in (schema, *schema.get("anyOf", ()))}
-    for kind, (pattern, allowed) in _NUMBERS.items():
+    for kind, (pattern, allowed) in _PLAIN.items():
         if kind in kinds and any(not pattern.fullmatch(value) for value in values):
             raise InvalidRequestError(source, name, str(SpecError(name, values[0], allowed)))

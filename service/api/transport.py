@@ -12,6 +12,7 @@ from contextlib import suppress
 from socket import socket
 from typing import Any
 
+import httptools
 import uvicorn
 from starlette.requests import Request
 from starlette.responses import Response
@@ -21,6 +22,15 @@ from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
 from service import start
 from service.api.problems import problem
+from service.api.wire import (
+    MAX_TARGET_BYTES,
+    EndingTransport,
+    RefusedError,
+    origin_form,
+    refusal,
+    require_sound_head,
+    without_upgrade,
+)
 from service.settings import Settings
 
 _LOG = logging.getLogger(__name__)
@@ -48,16 +58,22 @@ class Protocol(HttpToolsProtocol):
         self._max_connections = max_connections
         self._receiving = False
         self._in_head = True
+        self._head_bytes = 0
         self._bytes = 0
         self._body_bytes = 0
         self._late: asyncio.TimerHandle | None = None
         self._unread: asyncio.TimerHandle | None = None
+        self._refusal: RefusedError | None = None
+        self._is_repeated = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first request, if there is room for one more."""
-        super().connection_made(transport)
+        self._ending = EndingTransport(transport, self.loop, self._is_sent_more)
+        super().connection_made(self._ending)
         if len(self.connections) > self._max_connections + _RESERVED:
-            self._refuse(503, "too many connections")
+            self._write_refusal(RefusedError(503, "too many connections"))
+            # At once: a connection that is one too many is not kept to be read to its end.
+            transport.close()
         else:
             self._late = self.loop.call_later(self._request_s, self._is_late)
 
@@ -66,39 +82,85 @@ class Protocol(HttpToolsProtocol):
         for timer in (self._late, self._unread):
             if timer is not None:
                 timer.cancel()
+        self._ending.release()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
         """Take what came, and see that the rest of a request follows in time."""
-        if self.transport.is_closing():
+        if self._ending.is_closing():
+            self._ending.drop(len(data))
             return
+        if self._refusal is not None:
+            return
+        self._unset_keepalive_if_required()
         self._bytes += len(data)
-        super().data_received(data)
+        try:
+            self._parse(data)
+        except httptools.HttpParserError as error:
+            self._refuse(refusal(error))
+        else:
+            if self._receiving and self._bytes > _MAX_HEAD_BYTES + _CHUNK_OVERHEAD * self._body_bytes:
+                self._refuse(_long_head())
         if self.transport.is_closing():
             return
-        if self._receiving and self._bytes > _MAX_HEAD_BYTES + _CHUNK_OVERHEAD * self._body_bytes:
-            self._refuse(431, f"a head may have {_MAX_HEAD_BYTES} bytes")
-        elif self._receiving or not self._is_answering():
+        if self._refusal is None and (self._receiving or not self._is_answering()):
             # Also after stray bytes between requests, which have stopped the clock of idle connections.
             self._late = self._late or self.loop.call_later(self._request_s, self._is_late)
         elif self._late is not None:
             self._late.cancel()
             self._late = None
 
+    def _parse(self, data: bytes) -> None:
+        try:
+            self.parser.feed_data(data)
+        except httptools.HttpParserUpgrade as upgrade:
+            # The parser ends with a head that would go on in another protocol. None is spoken here, so the request
+            # is one like any other (RFC 9110, 7.8), and its body and what follows are left to another parser.
+            head = without_upgrade(
+                self.parser.get_method(), self.url, self.parser.get_http_version(), list(self.headers)
+            )
+            self.parser = httptools.HttpRequestParser(self)
+            self.parser.set_dangerous_leniencies(lenient_data_after_close=True)
+            self._is_repeated = True
+            self.parser.feed_data(head)
+            self._parse(data[upgrade.args[0] :])
+
     def on_message_begin(self) -> None:
         """Take the first byte of a request."""
-        self._receiving = self._in_head = True
-        super().on_message_begin()
+        if not self._is_repeated:
+            self._receiving = self._in_head = True
+            self._head_bytes = 0
+            super().on_message_begin()
+
+    def on_url(self, url: bytes) -> None:
+        """Take a piece of the request target."""
+        if not self._is_repeated:
+            super().on_url(url)
+            if len(self.url) > MAX_TARGET_BYTES:
+                raise RefusedError(414, f"a request target may have {MAX_TARGET_BYTES} bytes")
 
     def on_header(self, name: bytes, value: bytes) -> None:
         """Keep a header; one that follows a chunked body is of no use here, and could be as long as it likes."""
         if self._in_head:
+            self._head_bytes += len(name) + len(value) + 4
+            if self._head_bytes > _MAX_HEAD_BYTES:
+                raise _long_head()
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
         """Start the application on a request."""
+        if self._is_repeated:
+            self._is_repeated = False
+            return
+        version = self.parser.get_http_version()
+        require_sound_head(self.parser.get_method(), version, self.headers)
+        self.url = origin_form(self.url)
+        self.expect_100_continue &= version == "1.1"
         self._in_head = False
         super().on_headers_complete()
+        if self.expect_100_continue:
+            # A client that is answered before it was told to go on may send its body, or another request.
+            self.cycle.keep_alive = False
 
     def on_body(self, body: bytes) -> None:
         """Give a piece of the body on."""
@@ -107,9 +169,17 @@ class Protocol(HttpToolsProtocol):
 
     def on_message_complete(self) -> None:
         """Take the last byte of a request."""
+        if self.parser.should_upgrade():
+            return
         self._receiving = False
         self._bytes = self._body_bytes = 0
         super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """Go on with the next request, or with what is wrong with it."""
+        super().on_response_complete()
+        if self._refusal is not None:
+            self._refuse(self._refusal)
 
     def pause_writing(self) -> None:
         """Give a client that takes no more of an answer time to do so."""
@@ -131,16 +201,9 @@ class Protocol(HttpToolsProtocol):
     def shutdown(self) -> None:
         """Let the answers under way come to their end; a request that is not whole gets none."""
         if self._receiving and self._may_refuse():
-            self.transport.close()
+            self.transport.abort()
         else:
             super().shutdown()
-
-    def send_400_response(self, msg: str) -> None:
-        """Answer what is not HTTP."""
-        if self._may_refuse():
-            self._refuse(400, msg)
-        else:
-            self.transport.close()
 
     def _is_late(self) -> None:
         self._late = None
@@ -149,10 +212,13 @@ class Protocol(HttpToolsProtocol):
         if not self._receiving or (not self._in_head and self.cycle.response_started):
             self.transport.close()
         elif self._may_refuse():
-            self._refuse(408, f"a request has to come whole within {self._request_s:g} s")
+            self._refuse(RefusedError(408, f"a request has to come whole within {self._request_s:g} s"))
         else:
             # It came behind others, whose answers go first.
             self._late = self.loop.call_later(self._request_s, self._is_late)
+
+    def _is_sent_more(self) -> bool:
+        return self._receiving or bool(self.pipeline) or self._refusal is not None
 
     def _is_answering(self) -> bool:
         return self.cycle is not None and not self.cycle.response_complete
@@ -163,14 +229,28 @@ class Protocol(HttpToolsProtocol):
             return not self._is_answering()
         return not self.pipeline and not self.cycle.response_started
 
-    def _refuse(self, status: int, detail: str) -> None:
-        """Answer without the application, and close the connection."""
-        answer = problem(None, status, detail, headers={"Connection": "close"})
+    def _refuse(self, error: RefusedError) -> None:
+        """Answer without the application, once what came before is answered, and close the connection."""
+        if self._may_refuse():
+            self._write_refusal(error)
+            self._ending.close_gently()
+            if self._receiving and not self._in_head:
+                self.cycle.disconnected = True
+                self.cycle.message_event.set()
+        elif not self._in_head and self._receiving and not self.pipeline:
+            # Its answer has begun.
+            self._ending.close_gently()
+        else:
+            self._refusal = error
+
+    def _write_refusal(self, error: RefusedError) -> None:
+        answer = problem(None, error.status, str(error), headers={"Connection": "close"})
         headers = (b"%s: %s\r\n" % header for header in (*self.server_state.default_headers, *answer.raw_headers))
-        self.transport.write(b"".join((STATUS_LINE[status], *headers, b"\r\n", answer.body)))
-        self.transport.close()
-        # A client that takes nothing would keep even a closed connection.
-        self.loop.call_later(self._request_s, self.transport.abort)
+        self.transport.write(b"".join((STATUS_LINE[error.status], *headers, b"\r\n", answer.body)))
+
+
+def _long_head() -> RefusedError:
+    return RefusedError(431, f"a head may have {_MAX_HEAD_BYTES} bytes")
 
 
 class Admission:

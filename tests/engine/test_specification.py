@@ -1,10 +1,12 @@
 """Specifications, the catalogue and grids: what is accepted, what is refused and how it is told."""
 
 import json
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 
 from engine.catalogue import (
     camera_names,
@@ -28,10 +30,65 @@ from engine.errors import SpecError
 from engine.grid import Grid, expand, preset_names
 from engine.json_text import read_json
 from engine.scene import build_scene
-from engine.spec import Analysis, Host, Realization, realization_from_dict
+from engine.spec import Analysis, Camera, Host, LensSystem, Realization, realization_from_dict
 from engine.validation import field_path, path_steps
 
 HE0435 = Realization(system="HE0435", l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=21.0))
+
+
+def zeros(document: object, steps: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+    """Places of the numbers of a document that are floating-point zeros."""
+    if isinstance(document, dict | list):
+        parts = document.items() if isinstance(document, dict) else enumerate(document)
+        return [place for step, part in parts for place in zeros(part, (*steps, step))]
+    return [steps] if isinstance(document, float) and document == 0.0 else []
+
+
+MANY_ZEROS = {
+    "system": {
+        **TypeAdapter(LensSystem).dump_python(load_system("HE0435"), mode="json"),
+        "priors": {"x": {"low": 0.0, "high": 1.0}, "y": {"mean": 0.0, "sd": 1.0}},
+    },
+    "l_eta": 1.0,
+    "host": {"n": 2.0, "r_eff": 0.39, "magnitude": 21.0},
+    "optics": {"defocus_nm": 0.0, "jitter": 0.0},
+    "analysis": {"mask_inner": 0.0, "core_radius": 0.0},
+}
+ZEROS = zeros(realization_from_dict(MANY_ZEROS).to_dict())
+
+
+@given(negative=st.sets(st.sampled_from(ZEROS), min_size=1))
+def test_a_negative_zero_is_zero_wherever_it_stands(negative: set[tuple[str | int, ...]]) -> None:
+    plain = realization_from_dict(MANY_ZEROS)
+    document = plain.to_dict()
+    for steps in negative:
+        place: Any = document
+        for step in steps[:-1]:
+            place = place[step]
+        place[steps[-1]] = -0.0
+    read = realization_from_dict(document)
+    assert read == plain
+    assert read.digest == plain.digest
+    assert read.observation_digest == plain.observation_digest
+
+
+@pytest.mark.parametrize("kind", [Realization, Grid, Camera])
+def test_every_number_that_may_be_zero_is_read_without_its_sign(kind: type) -> None:
+    adapter = TypeAdapter(kind)
+    found = 0
+    waiting: list[Any] = [adapter.core_schema]
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, dict):
+            if part.get("type") == "function-after" and part["schema"].get("type") == "float":
+                found += 1
+                continue
+            if part.get("type") == "float":
+                assert part.get("gt", -1.0) >= 0.0 or part.get("ge", -1.0) > 0.0, part
+            waiting.extend(value for key, value in part.items() if key not in {"metadata", "ref"})
+        elif isinstance(part, list | tuple):
+            waiting.extend(part)
+    assert found or kind is Grid
 
 
 def test_all_eight_systems_and_three_cameras_load() -> None:

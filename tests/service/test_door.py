@@ -242,6 +242,10 @@ REFUSED = {
     "wait nan": Refused(http("GET", f"/v1/grids/{GRID}/events?wait=nan"), 422, "wait", "query"),
     "wait 1_0": Refused(http("GET", f"/v1/grids/{GRID}/events?wait=1_0"), 422, "wait", "query"),
     "no switch": Refused(post(BODY, query="?dry_run=maybe"), 422, "dry_run", "query"),
+    "yes as a switch": Refused(post(BODY, query="?dry_run=yes"), 422, "dry_run", "query"),
+    "one as a switch": Refused(post(BODY, query="?dry_run=1"), 422, "dry_run", "query"),
+    "capitals as a switch": Refused(post(BODY, query="?dry_run=True"), 422, "dry_run", "query"),
+    "parameter of the document": Refused(http("GET", "/openapi.json?x=1"), 422, "x", "query"),
     "a switch twice": Refused(post(BODY, query="?dry_run=true&dry_run=true"), 422, "dry_run", "query"),
     "unknown parameter": Refused(http("GET", "/v1/grids?Limit=1"), 422, "Limit", "query"),
     "parameter in brackets": Refused(http("GET", "/v1/grids?limit[]=1"), 422, "limit[]", "query"),
@@ -381,3 +385,106 @@ def test_the_head_of_a_stream_comes_alone(server: Server) -> None:
 def test_json_is_taken_however_its_type_is_written(server: Server, form: str) -> None:
     assert ask(server, post(BODY, form=("Content-Type", form), query="?dry_run=true")).status == 200
     assert ask(server, post({**BODY, "name": "Größe 3 – 日本"}, ("Content-Encoding", "identity"))).status == 202
+
+
+def raw(first: bytes, *lines: bytes, body: bytes = b"") -> bytes:
+    return b"\r\n".join((first, *lines)) + b"\r\n\r\n" + body
+
+
+GET, HOST, CLOSE = b"GET /healthz HTTP/1.1", b"Host: a", b"Connection: close"
+POST = (b"POST /v1/grids HTTP/1.1", HOST, b"Content-Type: application/json")
+CHUNKED = b"Transfer-Encoding: chunked"
+LARGE = b"x" * 20_000_000
+MALFORMED = {
+    "no request line": (400, b"\x00\x01\x02\r\n\r\n"),
+    "tls": (400, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + b"\x00" * 64),
+    "http/2": (400, b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"),
+    "no version": (505, raw(b"GET /")),
+    "version 2.0": (505, raw(b"GET / HTTP/2.0", HOST)),
+    "version 3.0": (505, raw(b"GET / HTTP/3.0", HOST)),
+    "version 0.9": (505, raw(b"GET / HTTP/0.9", HOST)),
+    "version of letters": (400, raw(b"GET / HTTP/x.y", HOST)),
+    "unknown method": (400, raw(b"FOO / HTTP/1.1", HOST)),
+    "small method": (400, raw(b"get / HTTP/1.1", HOST)),
+    "long method": (400, raw(b"G" * 100_000 + b" / HTTP/1.1", HOST)),
+    "connect": (501, raw(b"CONNECT a:80 HTTP/1.1", HOST)),
+    "connect to a path": (501, raw(b"CONNECT /healthz HTTP/1.1", HOST)),
+    "space in target": (400, raw(b"GET /a b HTTP/1.1", HOST)),
+    "no slash": (400, raw(b"GET healthz HTTP/1.1", HOST)),
+    "raw bytes in target": (400, raw(b"GET /v1/systems/\xff HTTP/1.1", HOST)),
+    "address without a path": (404, raw(b"GET http://a HTTP/1.1", HOST, CLOSE)),
+    "address with a query alone": (404, raw(b"GET http://a?x=1 HTTP/1.1", HOST, CLOSE)),
+    "address with no port": (400, raw(b"GET http://a:99999/healthz HTTP/1.1", HOST)),
+    "asterisk": (404, raw(b"GET * HTTP/1.1", HOST, CLOSE)),
+    "target of 33 kB": (414, raw(b"GET /" + b"x" * 33_000 + b" HTTP/1.1", HOST)),
+    "target of 100 kB": (414, raw(b"GET /" + b"x" * 100_000 + b" HTTP/1.1", HOST)),
+    "target of 5 MB": (414, raw(b"GET /" + b"x" * 5_000_000 + b" HTTP/1.1", HOST)),
+    "long query": (414, raw(b"GET /v1/grids?cursor=" + b"x" * 100_000 + b" HTTP/1.1", HOST)),
+    "no colon": (400, raw(b"GET / HTTP/1.1", b"Host a")),
+    "space before colon": (400, raw(b"GET / HTTP/1.1", b"Host : a")),
+    "space in a name": (400, raw(GET, HOST, b"X Y: a")),
+    "empty name": (400, raw(GET, HOST, b": a")),
+    "nul in a header": (400, raw(GET, HOST, b"X: a\x00b")),
+    "cr in a header": (400, raw(GET, HOST, b"X: a\rb")),
+    "folded": (400, raw(GET, HOST, b"X: a", b" b")),
+    "line feeds alone": (400, b"GET /healthz HTTP/1.1\nHost: a\n\n"),
+    "no host": (400, raw(GET)),
+    "two hosts": (400, raw(GET, HOST, HOST)),
+    "a path as host": (400, raw(GET, b"Host: a/b?c@d")),
+    "long header": (431, raw(GET, HOST, b"X: " + b"x" * 200_000)),
+    "many headers": (431, raw(GET, HOST, *[b"X-Many: some"] * 10_000)),
+    "5 MB of headers": (431, raw(GET, HOST, *[b"X: " + b"x" * 500] * 10_000)),
+    "long trailer": (431, raw(*POST, CHUNKED, body=b"2\r\n{}\r\n0\r\n" + b"X: y\r\n" * 40_000 + b"\r\n")),
+    "negative length": (400, raw(*POST, b"Content-Length: -1")),
+    "signed length": (400, raw(*POST, b"Content-Length: +2", body=b"{}")),
+    "endless length": (400, raw(*POST, b"Content-Length: " + b"9" * 40)),
+    "two lengths": (400, raw(*POST, b"Content-Length: 1", b"Content-Length: 2", body=b"ab")),
+    "list of lengths": (400, raw(*POST, b"Content-Length: 2, 2", body=b"{}")),
+    "length and chunks": (400, raw(*POST, b"Content-Length: 3", CHUNKED, body=b"0\r\n\r\n")),
+    "chunks and length": (400, raw(*POST, CHUNKED, b"Content-Length: 3", body=b"0\r\n\r\n")),
+    "gzip and chunks": (501, raw(*POST, b"Transfer-Encoding: gzip, chunked", body=b"0\r\n\r\n")),
+    "chunks twice": (400, raw(*POST, CHUNKED, CHUNKED, body=b"0\r\n\r\n")),
+    "chunks of http/1.0": (400, raw(b"POST /v1/grids HTTP/1.0", CHUNKED, body=b"0\r\n\r\n")),
+    "bad chunk": (400, raw(*POST, CHUNKED, body=b"zz\r\n{}\r\n0\r\n\r\n")),
+    "bad second chunk": (400, raw(*POST, CHUNKED, body=b"2\r\n{}\r\nzz\r\n")),
+    "chunk longer than said": (400, raw(*POST, CHUNKED, body=b"2\r\n{}x\r\n0\r\n\r\n")),
+    "bad trailer": (400, raw(*POST, CHUNKED, body=b"2\r\n{}\r\n0\r\nX Y: 1\r\n\r\n")),
+    "another expectation": (417, raw(*POST, b"Expect: tea", b"Content-Length: 2", body=b"{}")),
+    "body that is asked for first": (413, raw(*POST, b"Expect: 100-continue", b"Content-Length: 20000000")),
+    "large body": (413, raw(*POST, b"Content-Length: %d" % len(LARGE), body=LARGE)),
+    "large body, then close": (413, raw(*POST, CLOSE, b"Content-Length: %d" % len(LARGE), body=LARGE)),
+    "large chunk": (413, raw(*POST, CHUNKED, body=b"%x\r\n" % len(LARGE) + LARGE)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_what_is_not_http_is_told_so_and_nothing_else_happens(server: Server, name: str) -> None:
+    status, request = MALFORMED[name]
+    assert_problem(ask(server, request), status)
+    assert answers(server)
+
+
+@pytest.mark.parametrize("bad", ["space in target", "two hosts", "bad chunk", "large body", "target of 100 kB"])
+def test_a_bad_request_behind_good_ones_takes_no_answer_from_them(server: Server, bad: str) -> None:
+    status, request = MALFORMED[bad]
+    sent = 2 * raw(GET, HOST) + request + raw(GET, HOST)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+        connection.sendall(sent)
+        received = b""
+        while piece := connection.recv(65536):
+            received += piece
+    assert re.findall(rb"HTTP/1\.1 (\d+) ", received) == [b"200", b"200", b"%d" % status]
+
+
+@pytest.mark.parametrize("protocol", [b"websocket", b"h2c"])
+def test_a_wish_for_another_protocol_changes_nothing(server: Server, protocol: bytes) -> None:
+    wish = (b"Connection: Upgrade, HTTP2-Settings", b"Upgrade: " + protocol)
+    content = json.dumps(BODY).encode()
+    first = raw(*POST, *wish, b"Content-Length: %d" % len(content), body=content)
+    second = raw(*POST, *wish, CHUNKED, body=b"%x\r\n%s\r\n0\r\n\r\n" % (len(content), content))
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+        connection.sendall(first + second + raw(GET, HOST, *wish) + raw(GET, HOST, CLOSE))
+        received = b""
+        while piece := connection.recv(65536):
+            received += piece
+    assert re.findall(rb"HTTP/1\.1 (\d+) ", received) == [b"202", b"202", b"200", b"200"]
