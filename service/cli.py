@@ -6,24 +6,26 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
-import httpx
 import typer
-from rich.console import Console
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
 from service import VERSION
-from service.client import Client, ClientError, RequestError
 from service.measuring import measure
 from service.outputs import require_file
 from service.pictures import COMMANDS, named_or_read
 from service.request_file import read_request
-from service.settings import ConfigurationError, Settings, read_settings
-from service.start import CONFIGURATION
-from service.tables import grid_line, runs_table, summary_table
-from service.watch import progress
+from service.start import CONFIGURATION, ConfigurationError
+
+if TYPE_CHECKING:
+    # What a command loads it loads itself: help and mistakes are told at once.
+    from rich.console import Console
+
+    from service.client import Client
+    from service.schemas import GridView
+    from service.settings import Settings
 
 _ARGUMENTS_WANTED = "NoArgsIsHelpError"
 
@@ -47,11 +49,9 @@ class _CommandLine(TyperGroup):
                 typer.echo(error.format_message())
                 raise SystemExit(CONFIGURATION) from None
             self._refuse(error.format_message(), error.exit_code)
-        except (ConfigurationError, RequestError) as error:
+        except ConfigurationError as error:
             self._refuse(str(error), CONFIGURATION)
-        except httpx.RequestError as error:
-            self._refuse(f"the service does not answer: {error}", 1)
-        except (ClientError, _FailedError, OSError, typer.Abort) as error:
+        except (_FailedError, OSError, typer.Abort) as error:
             self._refuse(str(error) or "given up", 1)
         raise SystemExit(code if isinstance(code, int) else 0)
 
@@ -77,15 +77,39 @@ Floats = Annotated[list[float] | None, typer.Option()]
 
 
 def _console() -> Console:
+    from rich.console import Console  # noqa: PLC0415 - as all that a command needs
+
     return Console()
 
 
 def _settings(**changes: Any) -> Settings:
+    from service.settings import Settings, read_settings  # noqa: PLC0415 - as above
+
     return read_settings(Settings, **changes)
 
 
-def _client(url: str | None) -> Client:
-    return Client(_settings().url if url is None else url)
+@contextmanager
+def _client(url: str | None) -> Iterator[Client]:
+    """A client of the service; where it is not served, the command ends with a line."""
+    import httpx  # noqa: PLC0415 - as above
+
+    from service.client import Client, ClientError, RequestError  # noqa: PLC0415 - as above
+
+    try:
+        with Client(_settings().url if url is None else url) as client:
+            yield client
+    except RequestError as error:
+        raise ConfigurationError(str(error)) from error
+    except ClientError as error:
+        raise _FailedError(str(error)) from error
+    except httpx.RequestError as error:
+        raise _FailedError(f"the service does not answer: {error}") from error
+
+
+def _tell(grid: GridView) -> None:
+    from service.tables import grid_line  # noqa: PLC0415 - as above
+
+    typer.echo(grid_line(grid))
 
 
 def _version(wanted: bool) -> None:
@@ -216,13 +240,15 @@ def status(
     with _client(url) as client:
         if grid is None:
             for item in client.grids().items:
-                typer.echo(grid_line(item))
+                _tell(item)
         elif watch:
             _watch(client, grid)
         elif runs:
+            from service.tables import runs_table  # noqa: PLC0415 - as above
+
             _console().print(runs_table(client.runs(grid)))
         else:
-            typer.echo(grid_line(client.status(grid)))
+            _tell(client.status(grid))
 
 
 @app.command()
@@ -237,6 +263,8 @@ def results(
         if as_json:
             typer.echo(summary.model_dump_json(indent=2))
         else:
+            from service.tables import summary_table  # noqa: PLC0415 - as above
+
             _console().print(summary_table(summary))
 
 
@@ -244,28 +272,28 @@ def results(
 def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Cancel a grid."""
     with _client(url) as client:
-        typer.echo(grid_line(client.cancel(grid)))
+        _tell(client.cancel(grid))
 
 
 @app.command()
 def pause(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Start no further run of a grid for now; running ones go on to their end."""
     with _client(url) as client:
-        typer.echo(grid_line(client.pause(grid)))
+        _tell(client.pause(grid))
 
 
 @app.command()
 def resume(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Go on with a paused grid."""
     with _client(url) as client:
-        typer.echo(grid_line(client.resume(grid)))
+        _tell(client.resume(grid))
 
 
 @app.command()
 def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
     """Queue again what failed, was quarantined or was cancelled."""
     with _client(url) as client:
-        typer.echo(grid_line(client.retry(grid)))
+        _tell(client.retry(grid))
 
 
 @app.command()
@@ -308,6 +336,7 @@ def db_upgrade(revision: Annotated[str, typer.Argument(help="Which; the newest w
     """Bring the database to a newer schema, by default the newest; may be repeated, by several at once."""
     from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
+    _require_revision(revision, "head")
     settings = _database_settings()
     with _migrating():
         migrate.upgrade(settings.database, revision)
@@ -322,6 +351,7 @@ def db_downgrade(
     """Take the database back to an older schema; what only the newer one has is lost. Stop the service first."""
     from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
 
+    _require_revision(revision, "base")
     settings = _database_settings()
     if not yes:
         typer.confirm(f"take the database back to revision {revision}?", abort=True)
@@ -352,6 +382,14 @@ def db_check() -> None:
     typer.echo("the database is what the code expects")
 
 
+def _require_revision(revision: str, other: str) -> None:
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    allowed = (*migrate.revisions(), other)
+    if revision not in allowed:
+        raise typer.BadParameter(f"there is no revision {revision!r}: allowed is one of {', '.join(allowed)}")
+
+
 def _database_settings() -> Settings:
     """The settings, with a database that can be used as far as this machine is concerned."""
     from service import preflight  # noqa: PLC0415 - loads SQLAlchemy
@@ -373,14 +411,16 @@ def db_prune(
 
     First it shows what would go, and what stays and why. The service may run meanwhile.
     """
-    from service import pruning  # noqa: PLC0415 - loads fsspec
+    from service import preflight, pruning  # noqa: PLC0415 - loads fsspec
 
     try:
         age = pruning.read_age(older_than)
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--older-than") from error
+    settings = _database_settings()
+    preflight.require_artefacts(settings)
     with _migrating():
-        raise typer.Exit(pruning.prune(_database_settings(), age, _console(), dry_run=dry_run, ask=not yes))
+        raise typer.Exit(pruning.prune(settings, age, _console(), dry_run=dry_run, ask=not yes))
 
 
 @contextmanager
@@ -402,8 +442,10 @@ def _migrating() -> Iterator[None]:
 
 
 def _watch(client: Client, grid_id: str) -> None:
+    from service.watch import progress  # noqa: PLC0415 - as above
+
     with progress(_console()) as show:
         grid = client.wait(grid_id, show)
-    typer.echo(grid_line(grid))
+    _tell(grid)
     if grid.counts.done != grid.n_runs:
         raise typer.Exit(1)

@@ -11,6 +11,7 @@ import importlib
 import importlib.util
 import multiprocessing
 import os
+import shutil
 import socket
 import ssl
 import tempfile
@@ -21,7 +22,8 @@ from pathlib import Path
 import fsspec
 import psutil
 
-from service.settings import ConfigurationError, Settings, bracketed
+from service.settings import Settings, bracketed
+from service.start import ConfigurationError
 from service.store.address import AddressError, SqliteAddress, read_address
 
 API_PORT = "HOSTLENS_HOST and HOSTLENS_PORT"
@@ -74,6 +76,8 @@ def require_cluster(settings: Settings) -> None:
     kind = settings.kind_of_cluster
     if kind in _EXTRAS:
         _require_module("HOSTLENS_CLUSTER", _EXTRAS[kind], kind)
+    if kind == "slurm" and shutil.which("sbatch") is None:
+        raise ConfigurationError("HOSTLENS_CLUSTER: slurm needs the command sbatch, which is not in PATH")
     if settings.slurm_interface is not None and settings.slurm_interface not in (found := psutil.net_if_addrs()):
         raise ConfigurationError(
             f"HOSTLENS_SLURM_INTERFACE: got {settings.slurm_interface!r}; allowed is one of {', '.join(found)}"

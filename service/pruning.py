@@ -21,14 +21,17 @@ from service.store.database import Database
 from service.store.retention import KINDS, Retention, Share, oldest_lease, referred_artefacts
 
 _UNITS = {"h": timedelta(hours=1), "d": timedelta(days=1), "w": timedelta(weeks=1)}
+_CENTURY = timedelta(days=36525)
 
 
 def read_age(text: str) -> timedelta:
-    """An age as ``90d``, ``12h`` or ``4w``; ValueError for anything else."""
+    """An age as ``90d``, ``12h`` or ``4w``, of a century at most; ValueError for anything else."""
     found = re.fullmatch(r"([1-9][0-9]{0,5})([hdw])", text)
-    if found is None:
-        raise ValueError(f"not an age: {text!r}; as 90d, 12h or 4w")
-    return int(found[1]) * _UNITS[found[2]]
+    age = timedelta() if found is None else int(found[1]) * _UNITS[found[2]]
+    # Before that there is hardly a calendar that a database could compare with, and no grid.
+    if not timedelta() < age <= _CENTURY:
+        raise ValueError(f"not an age: {text!r}; as 90d, 12h or 4w, a century at most")
+    return age
 
 
 def prune(settings: Settings, age: timedelta, console: Console, *, dry_run: bool, ask: bool) -> int:

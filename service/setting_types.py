@@ -70,6 +70,8 @@ def _artefacts(value: str) -> str:
     protocol, separator, path = value.partition("://")
     if not separator:
         return str(_home(Path(value)))
+    if not path:
+        raise ValueError("it names no place; allowed is a folder or an fsspec URL, as s3://bucket")
     if protocol in {"file", "local"}:
         return f"{protocol}://{_home(Path(path))}"
     if protocol == "memory":

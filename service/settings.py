@@ -27,6 +27,7 @@ from service.setting_types import (
     Walltime,
     WorkerMemory,
 )
+from service.start import ConfigurationError
 
 _PREFIX = "HOSTLENS_"
 OTHERS = frozenset({"HOSTLENS_URL", PARENT_FD, LISTENER_FD, API_NUMBER})
@@ -45,13 +46,6 @@ LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 _CLOSE_S = 8.0
 """What a dispatcher needs to hand runs back and to end its workers."""
 T = TypeVar("T", bound="LogSettings")
-
-
-class ConfigurationError(ValueError):
-    """A setting, or what it names, is not acceptable: one line that names the variable and what is allowed.
-
-    To start again would not help: processes end by it with exit code 2, and nobody starts them again.
-    """
 
 
 class LogSettings(BaseSettings):

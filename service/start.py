@@ -20,6 +20,13 @@ STOPS = (signal.SIGINT, signal.SIGTERM)
 _left_behind: list[Callable[[], None]] = []
 
 
+class ConfigurationError(ValueError):
+    """A setting, or what it names, is not acceptable: one line that names the variable and what is allowed.
+
+    To start again would not help: processes end by it with exit code 2, and nobody starts them again.
+    """
+
+
 def begin(*, service: bool = True) -> None:
     """Make standard streams that are closed, a home that is missing, and the handlers of the signals that end it.
 
@@ -69,8 +76,6 @@ def kept_back() -> Iterator[None]:
 @contextmanager
 def refusing() -> Iterator[None]:
     """Say in one line what is wrong with the configuration, and end with the code for it."""
-    from service.settings import ConfigurationError  # noqa: PLC0415 - takes a while to load
-
     try:
         yield
     except ConfigurationError as error:
@@ -112,5 +117,12 @@ def _open_streams() -> None:
 
 def _name_a_home() -> None:
     """As :mod:`engine.home` does, for what is loaded without the engine."""
-    if os.path.expanduser("~") == "~":
+    home = os.path.expanduser("~")
+    try:
+        os.stat(f"{home}/.")
+    except PermissionError:
+        home = "~"
+    except OSError:
+        pass  # not there: nobody reads or writes anything in it
+    if home == "~":
         os.environ["HOME"] = "/nonexistent"

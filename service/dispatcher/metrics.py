@@ -19,7 +19,8 @@ from prometheus_client import (
 from service import logs
 from service.dispatcher.stalls import REASONS
 from service.payload import ResultPayload
-from service.settings import ConfigurationError, Settings
+from service.settings import Settings
+from service.start import ConfigurationError
 from service.store.database import AWAY
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored

@@ -14,7 +14,8 @@ import dask.config
 from service import preflight, start
 from service.dispatcher.clusters import dask_config
 from service.dispatcher.nursery import ONE_THREAD
-from service.settings import ConfigurationError, Settings, bracketed
+from service.settings import Settings, bracketed
+from service.start import ConfigurationError
 
 _DEATH_TIMEOUT_S = 60
 

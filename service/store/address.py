@@ -86,6 +86,9 @@ def read_address(text: str) -> SqliteAddress | PostgresAddress:
     AddressError
         Another kind of database, or an option that is unknown or has no such value.
     """
+    # What follows a NUL the drivers' C code does not see: the host, say.
+    if "\x00" in unquote(text) or not _is_unicode(text):
+        raise AddressError("the database URL has a NUL or what is no Unicode")
     several = _HOSTS.fullmatch(text)
     try:
         url = make_url(text if several is None else several["before"] + (several["after"] or ""))
@@ -129,13 +132,16 @@ def _postgres(url: URL, hosts: list[str]) -> PostgresAddress:
             raise AddressError(f"the database URL has an option that libpq does not know: {name}")
         if name in _NUMBERS and not re.fullmatch(r"\s*-?\d+\s*", value):
             raise AddressError(f"the database URL has {name}={value}; a whole number is expected")
+        if name == "port":
+            _require_ports(value.split(","))
         if name in _CHOICES and value not in _CHOICES[name]:
             allowed = ", ".join(sorted(_CHOICES[name]))
             raise AddressError(f"the database URL has {name}={value}; one of {allowed} is expected")
     plain = {"user": url.username, "password": url.password, "dbname": url.database}
     options = {**{name: str(value) for name, value in plain.items() if value}, **options}
     if not hosts and url.host is not None:
-        hosts = [f"[{url.host}]:{url.port or ''}" if ":" in url.host else f"{url.host}:{url.port or ''}"]
+        port = "" if url.port is None else url.port
+        hosts = [f"[{url.host}]:{port}" if ":" in url.host else f"{url.host}:{port}"]
     hosts = hosts or ([given] if isinstance(given, str) else list(given))
     return PostgresAddress({**NETWORK, **options, **_hosts(hosts)})
 
@@ -143,13 +149,39 @@ def _postgres(url: URL, hosts: list[str]) -> PostgresAddress:
 def _hosts(hosts: list[str]) -> dict[str, str]:
     """``host`` and ``port`` of libpq, with as many entries each where there are several."""
     if len(hosts) == 1 and (hosts[0].startswith("/") or "," in hosts[0]):
+        _require_hosts([name for name in hosts[0].split(",") if not name.startswith("/")])
         return {"host": hosts[0]}  # a socket's folder, or what libpq takes as it is
     found = [_HOST.fullmatch(host) for host in hosts]
     if None in found:
         raise AddressError("the database URL has a host that is none")
     names = [match["host"].strip("[]") for match in found if match is not None]
     ports = [match["port"] or "" for match in found if match is not None]
+    _require_hosts(names)
+    _require_ports(ports)
     return {**({"host": ",".join(names)} if names else {}), **({"port": ",".join(ports)} if any(ports) else {})}
+
+
+def _require_hosts(names: list[str]) -> None:
+    """Names that can be asked for: each label of 1 to 63 characters."""
+    for name in names:
+        try:
+            name.encode("idna")
+        except UnicodeError:
+            raise AddressError(f"the database URL has a host that is none: {name[:80]!r}") from None
+
+
+def _require_ports(ports: list[str]) -> None:
+    for port in ports:
+        if port and not (re.fullmatch(r"[0-9]{1,5}", port) and 0 < int(port) < 65536):
+            raise AddressError(f"the database URL has the port {port[:80]!r}; one of 1 to 65535 is expected")
+
+
+def _is_unicode(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _once(name: str, value: str | tuple[str, ...]) -> str:

@@ -14,6 +14,7 @@ from alembic.util.exc import CommandError
 from sqlalchemy import Connection, text
 
 from service.store.database import Database
+from service.store.faults import SchemaMismatchError
 
 # Any number that no other program on the same database takes for its own advisory lock.
 _LOCK = 4_650_048_421
@@ -67,10 +68,14 @@ def downgrade(url: str, revision: str, folder: Path | None = None) -> None:
 
 def differences(url: str) -> str | None:
     """What ``alembic check`` finds between the migrated database and the tables in the code; None where they agree."""
+    database = Database(url, pooled=False)
     try:
+        database.require_schema()
         _run(url, command.check)
-    except MigrationError as error:
+    except (MigrationError, SchemaMismatchError) as error:
         return str(error)
+    finally:
+        database.close()
     return None
 
 

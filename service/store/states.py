@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ColumnElement, Connection, Update, update
-
-from service.store.tables import run
+if TYPE_CHECKING:
+    from sqlalchemy import ColumnElement, Connection, Update
 
 
 class RunState(StrEnum):
@@ -81,6 +80,8 @@ TRANSITIONS = {
 
 def move(connection: Connection, transition: Transition, *where: ColumnElement[bool], **values: Any) -> list[str]:
     """Carry out a transition on the runs that ``where`` picks and return the ids of those that it changed."""
+    from service.store.tables import run  # noqa: PLC0415 - as below
+
     return list(connection.scalars(moving(transition, *where, **values).returning(run.c.id)))
 
 
@@ -91,6 +92,11 @@ def moving(transition: Transition, *where: ColumnElement[bool], **values: Any) -
     of the service that changes a run's state. The token is cleared unless ``values`` sets one, so a lease ends with
     the state that it belonged to.
     """
+    # A client of the API needs the names of the states, and SQLAlchemy takes longer to load than all of the client.
+    from sqlalchemy import update  # noqa: PLC0415
+
+    from service.store.tables import run  # noqa: PLC0415
+
     return (
         update(run)
         .where(run.c.state.in_(sorted(transition.sources)), *where)

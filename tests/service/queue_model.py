@@ -78,6 +78,7 @@ class Forgetful(Database):
     """A database whose connection breaks after the next commit, if it is told to lose its answer."""
 
     loses = False
+    commits = 0
 
     def __init__(self, url: str) -> None:
         super().__init__(url, asked_first=False)
@@ -90,6 +91,7 @@ class Forgetful(Database):
         """As ever, but for the answer."""
         with super().write() as connection:
             yield connection
+        self.commits += 1
         if self.loses:
             self.loses = False
             raise OperationalError("COMMIT", {}, Exception("the answer was lost"))
@@ -129,6 +131,8 @@ class Queue(RuleBasedStateMachine):
 
     url: str
     steps_done = 0
+    pieces = False
+    """Whether operations take several commits: of these it is the last whose answer is lost."""
 
     grids = Bundle("grids")
     leases = Bundle("leases")
@@ -193,13 +197,17 @@ class Queue(RuleBasedStateMachine):
 
     def say(self, answer: Answer, operation: Callable[[], object]) -> list[object]:
         """What an operation says: nothing where the answer is lost, two things where it was repeated."""
-        self.database.loses = answer is not Answer.COMES
+        self.database.loses = answer is not Answer.COMES and not self.pieces
+        before = self.database.commits
         try:
-            return [operation()]
+            said = [operation()]
+            if self.pieces and answer is not Answer.COMES and self.database.commits > before:
+                said = [None, operation()] if answer is Answer.REPEATED else []
         except OperationalError:
-            return [None, operation()] if answer is Answer.REPEATED else []
+            said = [None, operation()] if answer is Answer.REPEATED else []
         finally:
             self.database.loses = False
+        return said
 
     # What processes do.
 
@@ -529,7 +537,7 @@ def _final(states: Iterable[RunState]) -> str:
     return "cancelled" if CANCELLED in found else "done" if found == {DONE} else "failed"
 
 
-def check(url: str, examples: int, steps: int = 40, *, shrink: bool = True) -> int:
+def check(url: str, examples: int, steps: int = 40, *, shrink: bool = True, pieces: bool = False) -> int:
     """Let the machine run on a database; the number of steps after which everything was as it had to be."""
     phases = [Phase.generate, Phase.shrink] if shrink else [Phase.generate]
     chosen = settings(
@@ -540,7 +548,7 @@ def check(url: str, examples: int, steps: int = 40, *, shrink: bool = True) -> i
         phases=phases,
         suppress_health_check=list(HealthCheck),
     )
-    machine: type[Queue] = type("Model", (Queue,), {"url": url, "steps_done": 0})
+    machine: type[Queue] = type("Model", (Queue,), {"url": url, "steps_done": 0, "pieces": pieces})
     run_state_machine_as_test(machine, settings=chosen)
     return int(machine.steps_done)
 

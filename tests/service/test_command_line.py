@@ -146,6 +146,18 @@ WRONG = {
     "a size that is NaN": ("drill", "sqlite-lock", "lock_s=nan"),
     "a report nowhere": ("drill", "cancel", "--json", "no/such/x.json"),
     "a drill on another database": ("drill", "cancel", "--database", "mysql://h/x"),
+    "a revision that there is not": ("db", "upgrade", "zzz"),
+    "no revision": ("db", "upgrade", ""),
+    "a relative revision": ("db", "upgrade", "+1"),
+    "a range of revisions": ("db", "upgrade", "0001:0002"),
+    "back to no revision": ("db", "downgrade", "", "--yes"),
+    "back to the future": ("db", "downgrade", "head", "--yes"),
+    "an age of 0": ("db", "prune", "--older-than", "0d"),
+    "an age below 0": ("db", "prune", "--older-than=-1d"),
+    "an age in years": ("db", "prune", "--older-than", "1y"),
+    "an age without unit": ("db", "prune", "--older-than", "90"),
+    "an age before all calendars": ("db", "prune", "--older-than", "999999w"),
+    "an age of a hundred thousand days": ("db", "prune", "--older-than", "100000d"),
     "a scheduler that listens nowhere": ("scheduler", "--host", "192.0.2.1"),
     "a scheduler without port": ("scheduler", "--host", "127.0.0.1", "--port", "0"),
     "health nowhere": ("scheduler", "--host", "127.0.0.1", "--port", "{port}", "--health", "nowhere"),
@@ -291,6 +303,42 @@ def in_shell(folder: Path, command: str, **variables: str) -> subprocess.Complet
         timeout=200,
         check=False,
     )
+
+
+def test_help_and_mistakes_load_nothing_that_takes_long(tmp_path: Path) -> None:
+    """All of them are told in a third of a second of CPU; each of these modules takes as long again, and more."""
+    slow = ("sqlalchemy", "alembic", "httpx", "fastapi", "dask", "numpy", "pydantic_settings", "engine")
+    for arguments in (["--help"], ["submit", "--help"], ["nonsense"], ["submit", "--file", "nowhere.json"]):
+        program = (
+            f"import sys; sys.argv[1:] = {arguments!r}\n"
+            "from service.__main__ import main\n"
+            "try:\n    main()\n"
+            f"finally:\n    print('loaded', *[name for name in {slow!r} if name in sys.modules], file=sys.stderr)"
+        )
+        (tmp_path / "program.py").write_text(program)
+        ended = in_shell(tmp_path, f"{sys.executable} program.py")
+        assert ended.stderr.splitlines()[-1] == b"loaded", (arguments, ended.stderr)
+
+
+@pytest.mark.parametrize("url", ["nonsense://x", "s3://bucket"])
+def test_a_store_of_a_kind_that_cannot_be_reached_is_told_before_it_is_pruned(
+    url: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOSTLENS_DATA_DIR", str(folder / "data"))
+    assert called("db", "upgrade").exit_code == 0
+    monkeypatch.setenv("HOSTLENS_ARTEFACT_URL", url)
+    assert "HOSTLENS_ARTEFACT_URL" in refused(called("db", "prune", "--older-than", "1d", "--yes"))
+
+
+def test_a_check_of_a_database_at_another_revision_says_what_to_do(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOSTLENS_DATA_DIR", str(folder / "data"))
+    assert called("db", "upgrade").exit_code == 0
+    assert called("db", "downgrade", "0003", "--yes").exit_code == 0
+    assert "run hostlens db upgrade" in refused(called("db", "check"), 1)
+    assert called("db", "downgrade", "base", "--yes").exit_code == 0
+    assert "run hostlens db upgrade" in refused(called("db", "check"), 1)
 
 
 ASCII = {"LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}

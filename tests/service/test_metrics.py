@@ -14,7 +14,8 @@ from sqlalchemy import event, text
 
 from service.api.app import create_app
 from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
-from service.settings import ConfigurationError, Settings
+from service.settings import Settings
+from service.start import ConfigurationError
 from service.store.database import Database
 from service.store.depth import QueueDepth
 from service.store.grids import GridStore

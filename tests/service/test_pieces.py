@@ -408,7 +408,8 @@ def _assert_counts_fit(mine: Stores) -> None:
 def test_the_queue_holds_its_promises_in_pieces(url: str, piece: int, monkeypatch: pytest.MonkeyPatch) -> None:
     cut(monkeypatch, piece)
     monkeypatch.setattr(pieces, "_TURN_S", 0.0)
-    assert check(url, examples=4, steps=40, shrink=False) >= 100
+    # What is left where an answer is lost between two pieces is looked at above; here all of them are made.
+    assert check(url, examples=4, steps=40, shrink=False, pieces=True) >= 100
 
 
 def test_others_write_between_the_pieces_of_sqlite(sqlite_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -515,7 +516,8 @@ def test_no_look_at_the_queue_goes_through_all_runs(database: Database, grids: G
             lines = _plan(database, statement, parameters)
             assert not [line for line in lines if _is_scan(line)], (lines, statement)
             if "run.state = 'leased'" in statement and "JOIN" not in statement:
-                assert any("ix_run_leased" in line for line in lines), (lines, statement)
+                # The leases, or those runs that are named.
+                assert any("ix_run_leased" in line or "(id=?)" in line for line in lines), (lines, statement)
 
 
 def _plan(database: Database, statement: str, parameters: Any) -> list[str]:

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from service import preflight
-from service.settings import ConfigurationError, Settings, read_settings
+from service.settings import Settings, read_settings
+from service.start import ConfigurationError
 from service.supervisor import Supervisor
 from tests.service.service_process import ROOT, free_port
 
@@ -82,6 +83,8 @@ REFUSED = [
     ("HOSTLENS_DATABASE_URL", f"postgresql://u:{SECRET}@h/x?sslmod=require", "libpq does not know: sslmod"),
     ("HOSTLENS_DATABASE_URL", "sqlite:///~nobody-of-this-name/x", "~ cannot be replaced"),
     ("HOSTLENS_ARTEFACT_URL", "memory://x", "not shared"),
+    ("HOSTLENS_ARTEFACT_URL", "file://", "names no place"),
+    ("HOSTLENS_ARTEFACT_URL", "s3://", "names no place"),
     ("HOSTLENS_DATA_DIR", "~nobody-of-this-name/x", "~ cannot be replaced"),
 ]
 
@@ -232,6 +235,47 @@ def test_every_process_ends_by_a_wrong_setting_with_one_line_and_2(command: tupl
     assert ended.returncode == 2
     assert ended.stdout == ""
     assert [line.split(":")[:2] for line in ended.stderr.splitlines()] == [["hostlens", " HOSTLENS_WORKER_MEMORY"]]
+
+
+@pytest.mark.parametrize("first", ["engine.home", "service.start"])
+def test_a_home_that_may_not_be_entered_is_taken_for_none(first: str, tmp_path: Path) -> None:
+    """As ``su`` and ``sudo`` leave it: the home of whoever called. Astropy cannot be imported with such a one."""
+    program = (
+        "import os, sys; real = os.stat\n"
+        "def stat(path, *rest, **options):\n"
+        f"    if str(path).startswith({str(tmp_path)!r} + '/'):\n"
+        "        raise PermissionError(13, 'Permission denied')\n"
+        "    return real(path, *rest, **options)\n"
+        "os.stat = stat\n"
+        f"import {first}\n"
+        "if 'service' in sys.modules:\n    sys.modules['service.start'].begin()\n"
+        "os.stat = real; print(os.environ['HOME'])"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (ended.stdout, ended.stderr) == ("/nonexistent\n", "")
+
+
+def test_slurm_without_its_command_is_told_before_a_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ConfigurationError, match="HOSTLENS_CLUSTER: slurm needs the command sbatch"):
+        preflight.require_cluster(Settings(data_dir=tmp_path, cluster="slurm"))
+
+
+def test_the_check_of_semaphores_leaves_no_process(tmp_path: Path) -> None:
+    """A process that watches over them would outlive by a moment whoever asked for it."""
+    program = (
+        "import psutil; from service import preflight; from service.settings import Settings\n"
+        "preflight.require_cluster(Settings()); print(psutil.Process().children())"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True, check=False)  # fmt: skip
+    assert ended.stdout == "[]\n", ended.stderr
 
 
 @pytest.mark.skipif(os.geteuid() != 0 or shutil.which("setpriv") is None, reason="only root can be somebody else")
