@@ -132,7 +132,9 @@ def _local(settings: Settings, security: Security | None) -> Any:
         threads_per_worker=1,
         processes=True,
         host="127.0.0.1",
-        dashboard_address=None,
+        # Its HTTP server cannot be left out: at a port that nobody else wants, and with no pages (dask_config).
+        dashboard_address="127.0.0.1:0",
+        scheduler_kwargs={"dashboard": False},
         memory_limit=settings.worker_memory,
         silence_logs=logging.ERROR,
     )
