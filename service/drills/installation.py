@@ -155,12 +155,17 @@ class Installation:
         return found
 
     def child(self, module: str) -> psutil.Process | None:
-        """The process of a module, None while it is not running."""
+        """The process of a module, or one of several; None while it is not running."""
+        return next(iter(self.children(module)), None)
+
+    def children(self, module: str) -> list[psutil.Process]:
+        """All processes of a module: there may be several that answer requests."""
+        found = []
         for process in self.processes():
             with suppress(psutil.Error):
                 if process.cmdline()[1:3] == ["-m", module]:
-                    return process
-        return None
+                    found.append(process)
+        return found
 
     def workers(self) -> list[psutil.Process]:
         """The processes that compute."""

@@ -233,9 +233,9 @@ class DiskFull(Drill):
 
 @contextmanager
 def _no_room(service: Installation) -> Iterator[None]:
-    """API and dispatcher cannot make a file longer than a page while this lasts."""
-    found = [service.child(module) for module in ("service.api", "service.dispatcher")]
-    pids = [process.pid for process in found if process is not None]
+    """No API process and no dispatcher can make a file longer than a page while this lasts."""
+    modules = ("service.api", "service.dispatcher")
+    pids = [process.pid for module in modules for process in service.children(module)]
     before = {pid: resource.prlimit(pid, resource.RLIMIT_FSIZE) for pid in pids}
     try:
         for pid, (_, hard) in before.items():

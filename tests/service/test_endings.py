@@ -390,7 +390,8 @@ def test_suspects_of_two_engines_take_turns_and_neither_clears_the_other_s_lane(
 
     pool.submit = noted  # type: ignore[method-assign]
     setting.run(
-        until=lambda: all(setting.grids.grid(each).finished_at is not None for each in (setting.grid_id, other))
+        until=lambda: all(setting.grids.grid(each).finished_at is not None for each in (setting.grid_id, other)),
+        steps=2000,  # a look for suspects is due each second
     )
     assert setting.grids.grid(setting.grid_id).counts.done == setting.grids.grid(other).counts.done == 3
     # Neither engine has to wait until the other has no suspect left.
