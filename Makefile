@@ -50,8 +50,9 @@ lint: install-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Two at a time, a file to each, so that what a file's tests share is made once; one thread for each numeric library.
 test: lint
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 # One thread: a worker has one core, and ratios are only fair so.
 bench: install-test
