@@ -436,6 +436,7 @@ class Realization:
         # Left out where it is not used, so that realizations from before there was such a field keep their digests.
         if dumped["optics"] is None:
             del dumped["optics"]
+        dumped["analysis"] |= _GONE
         for name in ("agn_position_sd", "background_sd"):
             if dumped["analysis"][name] is None:
                 del dumped["analysis"][name]
@@ -464,6 +465,8 @@ class Realization:
         return self.system if isinstance(self.system, str) else self.system.name
 
 
+_GONE = {"source_softening": None}
+"""Fields that an analysis once had, with the only value that they can still have: digests are made with them."""
 _REALIZATION = TypeAdapter(Realization)
 _SYSTEM = TypeAdapter(LensSystem)
 _CAMERA = TypeAdapter(Camera)
@@ -477,6 +480,9 @@ def spec_digest(document: dict[str, Any]) -> str:
 
 def realization_from_dict(document: object) -> Realization:
     """Read a realization from its JSON form; a SpecError names the field that is wrong."""
+    if isinstance(document, Mapping) and isinstance(analysis := document.get("analysis"), Mapping):
+        kept = {name: value for name, value in analysis.items() if value is not None or name not in _GONE}
+        document = {**document, "analysis": kept}
     try:
         return _REALIZATION.validate_python(document)
     except ValidationError as error:
