@@ -370,7 +370,7 @@ def test_the_command_line_migrates(empties: Empties, tmp_path: Path, monkeypatch
     assert run.invoke(app, ["db", "downgrade", "base", "--yes"]).exit_code == 0
     assert run.invoke(app, ["db", "current"]).output == f"database base, code {head}\n"
     refused = run.invoke(app, ["db", "upgrade", "9999"])
-    assert refused.exit_code == 1
+    assert refused.exit_code == 2
     assert "9999" in refused.output
 
 
