@@ -14,9 +14,9 @@ def main() -> None:
     start.begin(service=bool(service))
     from service.cli import app  # noqa: PLC0415 - takes a while
 
-    if not service:
-        start.interruptible()
     try:
+        if not service:
+            start.interruptible()
         app()
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)

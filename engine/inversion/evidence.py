@@ -167,7 +167,8 @@ def invert(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: Sour
         grid=mapping.grid,
         mapping=mapping.of_brightness(to_brightness),
         source=(solved.solution * to_brightness).reshape(model.shape),
-        factor=solved.factor.T / to_brightness[None, :],
+        # The other triangle is whatever lay in memory.
+        factor=np.triu(solved.factor.T) / to_brightness[None, :],
         curvature=curvature / np.outer(to_brightness, to_brightness),
         data_vector=solved.data_vector / to_brightness,
         condition_number=condition,

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 from fastapi.routing import APIRoute
 
 T = TypeVar("T")
-QUICK = ThreadPoolExecutor(8, "quick")
+QUICK = ThreadPoolExecutor(3, "quick")
 """For reads of the database. More threads answer no sooner: they only take turns at the interpreter."""
 PATIENT = ThreadPoolExecutor(32, "patient")
 """For what may have to wait: a transaction that writes for its turn, an artefact for its store."""
