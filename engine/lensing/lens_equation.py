@@ -139,14 +139,14 @@ def _map_cell(x: float, y: float, side: float, sx: float, sy: float, p: FloatArr
 def _candidates(
     sx: float, sy: float, half: float, theta_E: float, p: FloatArray, a: FloatArray, found: FloatArray
 ) -> int:
-    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many there are."""
+    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many, if they have room."""
     stack = np.empty((512, 4))
     # Off the lens by an irrational part, so that no corner and no centre ever falls on it.
     stack[0, 0], stack[0, 1] = p[5] + 0.0318309886 * half, p[6] + 0.0271828183 * half
     stack[0, 2], stack[0, 3] = 2.1 * half, 0.0
     top = 1
     n = 0
-    while top > 0:
+    while top > 0 and n <= found.shape[0]:
         top -= 1
         x, y, side, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
         cut = _is_coarse(x, y, side, theta_E, p)
