@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from engine import EngineError, SpecError, load_system, system_from_mapping
+from engine import EngineError, Host, Realization, SpecError, load_system, system_from_mapping
 from engine.errors import LensEquationError
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens, convergence_and_shear, deflection, magnification, source_position
-from engine.spec import Host, Realization
 from tests.engine.angular_solver import AngularSolver
 from tests.hard_cases import fifty_digits
 
