@@ -159,31 +159,3 @@ def test_all_images_parities_and_magnifications_are_those_of_an_independent_solv
             assert all(math.hypot(image.x - other.x, image.y - other.y) > 1e-5 * lens.theta_E for other in ours[:i])
         found_by_both += sum(abs(inverse) <= 100.0 for *_, inverse in theirs)
     assert found_by_both > 2 * 2500  # the comparison is not empty
-
-
-def test_two_images_are_born_on_crossing_the_astroid() -> None:
-    lens = PowerLawLens(1.0, 0.7, 0.0, 2.0)
-    inside, outside = None, None
-    low, high = 0.0, 0.6
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        count = len(solve_lens_equation(lens, middle, 0.03))
-        low, high = (middle, high) if count == 4 else (low, middle)
-        inside, outside = low, high
-    assert inside is not None
-    assert outside is not None
-    # The astroid's cusp on this axis lies where four images become two, found here to 1e-6 of the Einstein radius.
-    assert high - low < 1e-6
-    assert len(solve_lens_equation(lens, inside - 1e-5, 0.03)) == 4
-    assert len(solve_lens_equation(lens, outside + 1e-5, 0.03)) == 2
-
-
-def test_a_source_far_away_has_one_image() -> None:
-    lens = PowerLawLens(1.0, 0.8, 0.3, 2.0)
-    (image,) = solve_lens_equation(lens, 30.0, -20.0)
-    assert image.magnification == pytest.approx(1.0, abs=0.05)
-
-
-def test_the_central_image_of_a_shallow_profile_is_left_out() -> None:
-    lens = PowerLawLens(1.2, 0.85, 0.3, 1.8)
-    assert len(solve_lens_equation(lens, 0.01, 0.02)) == 4

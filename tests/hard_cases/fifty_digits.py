@@ -60,14 +60,21 @@ def brightness(profile: SersicProfile, x: float, y: float) -> float:
         )
         turned = mpmath.mpc(mpmath.mpf(x) - profile.x, mpmath.mpf(y) - profile.y) / mpmath.expj(mpmath.mpf(profile.phi))
         radius = mpmath.sqrt(q * turned.real**2 + turned.imag**2 / q)
-        central = profile.flux * k ** (2 * n) / (2 * mpmath.pi * n * mpmath.mpf(profile.r_eff) ** 2 * mpmath.gamma(2 * n))
+        central = (
+            profile.flux * k ** (2 * n) / (2 * mpmath.pi * n * mpmath.mpf(profile.r_eff) ** 2 * mpmath.gamma(2 * n))
+        )
         return float(central * mpmath.exp(-k * (radius / profile.r_eff) ** (1 / n)))
 
 
 def evidence(
-    design: np.ndarray, noise: np.ndarray, data: np.ndarray, regularisation: np.ndarray, ln_lambda: float, amplitudes: int
+    design: np.ndarray,
+    noise: np.ndarray,
+    data: np.ndarray,
+    regularisation: np.ndarray,
+    ln_lambda: float,
+    amplitudes: int,
 ) -> tuple[float, np.ndarray]:
-    """Ln Z and the solution of d = G s + noise: ``design`` (M, n + k) with the k amplitudes behind, ``noise`` (M,) sd."""
+    """Ln Z and the source of d = G s + noise: ``design`` (M, n + k), the k amplitudes behind; ``noise`` (M,)."""
     with mpmath.workdps(DIGITS):
         exact = np.vectorize(mpmath.mpf, otypes=[object])
         white, d = exact(design) / exact(noise)[:, None], exact(data) / exact(noise)

@@ -8,15 +8,15 @@ import pytest
 
 from engine.errors import InversionError, PosteriorError
 from engine.likelihood.amplitudes import LinearData
-from engine.source.regularisation import SourceModel
 from engine.likelihood.strength import find_strength
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, start_covariance
 from engine.posterior.proposal import StudentProposal
-from engine.posterior.surrogate import Surrogate
+from engine.posterior.surrogate import Surrogate, learn_surrogate
 from engine.posterior.target import Prior, Target, wide_prior
+from engine.source.regularisation import SourceModel
 from tests.engine.dense_oracle import LENS, Case
-from tests.engine.test_posterior import Gaussian, Hills
+from tests.engine.test_posterior import Gaussian
 
 MODEL = SourceModel((8, 8))
 SD = np.array([0.004, 0.02, 0.03, 0.03, 0.005, 0.005, 0.01, 0.01, 0.4])
@@ -34,8 +34,8 @@ def test_a_chain_that_may_go_to_no_regularisation_at_all_stays_where_the_evidenc
     """ln lambda free from -300 to 300: lambda from 1e-130 to 1e130, in a chain.
 
     Could go wrong: lambda of 0 and infinity make matrices that cannot be factorised, or whose evidence is rounding,
-    and a chain that trusts one of them never leaves it. Holds: the chain has the same mean and deviation of ln lambda
-    as one between -30 and 30, to 5 standard errors, and all its samples are finite.
+    and a chain that trusts one of them never leaves it. Holds: the chain has the same mean and deviation of ln
+    lambda as one between -30 and 30, to 5 standard errors, and all its samples are finite.
     """
     found = []
     for bound in (30.0, 300.0):
@@ -55,8 +55,9 @@ def test_a_chain_that_may_go_to_no_regularisation_at_all_stays_where_the_evidenc
 def test_a_chain_without_any_regularisation_is_refused_and_not_walked() -> None:
     """lambda to 0: a prior that leaves ln lambda between -300 and -200 alone, and more source pixels than data.
 
-    Could go wrong: minus infinity everywhere, and walkers that stand still are called a posterior. Holds: no optimum is
-    searched from there; a PosteriorError names the start, and the inversions that were refused are counted.
+    Could go wrong: minus infinity everywhere, and walkers that stand still are called a posterior. Holds: no
+    optimum is searched from there; a PosteriorError names the start, and the inversions that were refused are
+    counted.
     """
     case = Case(amplitudes=1)
     prior = wide_prior(LENS, shear=True)
@@ -77,9 +78,10 @@ def test_a_chain_without_any_regularisation_is_refused_and_not_walked() -> None:
 def test_a_chain_on_data_without_a_source_goes_to_infinite_regularisation_and_knows_nothing_of_the_lens() -> None:
     """lambda to infinity: data that are noise alone, ln lambda free from -12 to 60.
 
-    Could go wrong: the evidence is flat beyond some strength, and a chain invents a maximum or ends in an error of the
-    matrix. Holds: the strength has no maximum, which is an InversionError; a chain nonetheless fills ln lambda evenly up
-    to its bound (mean and deviation of a flat distribution), and the evidence there is that of no source to 0.01.
+    Could go wrong: the evidence is flat beyond some strength, and a chain invents a maximum or ends in an error of
+    the matrix. Holds: the strength has no maximum, which is an InversionError; a chain nonetheless fills ln lambda
+    evenly up to its bound (mean and deviation of a flat distribution), and the evidence there is that of no source
+    to 0.01.
     """
     case = Case(amplitudes=0)
     noise = 0.5 * np.sqrt(case.covariance) * np.random.default_rng(5).normal(size=case.data.size)
@@ -103,18 +105,44 @@ def test_a_chain_on_data_without_a_source_goes_to_infinite_regularisation_and_kn
     assert strengths.max() > 58.0
 
 
-def test_a_posterior_with_two_hills_has_both_in_the_right_share() -> None:
+class Hills:
+    """A normal hill, and three tenths of the weight on one half as wide, three deviations away."""
+
+    away, width, weight = 3.0, 0.5, 0.3
+
+    def __init__(self, dimensions: int = 5) -> None:
+        self.prior = Prior.flat(tuple("abcdefgh"[:dimensions]), np.full(dimensions, -30.0), np.full(dimensions, 30.0))
+        self.evaluations = 0
+
+    def __call__(self, values: np.ndarray) -> float:
+        self.evaluations += 1
+        other = (values - self.away * np.eye(values.size)[0]) / self.width
+        ln_other = math.log(self.weight) - values.size * math.log(self.width) - 0.5 * other @ other
+        return float(np.logaddexp(math.log(1.0 - self.weight) - 0.5 * values @ values, ln_other))
+
+
+def test_a_posterior_with_two_hills_has_both_in_the_right_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two hills three deviations apart, three tenths of the weight on one half as wide, started on the larger alone.
 
-    Could go wrong: the Gaussian approximation knows one hill, the walkers stay on it, and R-hat and tau are content.
-    Holds: what the chain finds on its way teaches the surrogate and it begins anew; it converges, and the mean is that
-    of both hills to 5 standard errors. All evaluations are accounted for.
+    Could go wrong: the Gaussian approximation knows one hill, the walkers stay on it, and R-hat and tau are
+    content. Holds: what the chain finds on its way teaches the surrogate and it begins anew; it converges, and the
+    mean is that of both hills to 5 standard errors. All evaluations are accounted for.
     """
+    lessons = []
+
+    def counted(known, prior, laplace, random):
+        lessons.append(len(known.values))
+        return learn_surrogate(known, prior, laplace, random)
+
+    monkeypatch.setattr("engine.posterior.chain.learn_surrogate", counted)
     target, done = Hills(), []
     chain = run_chain(
         target, Laplace(np.zeros(5), np.eye(5), 0.0, 1), walkers=12, max_steps=600, rng=np.random.default_rng(1),
         progress=done.append,
     )  # fmt: skip
+    assert len(lessons) >= 2
+    # What the chain went through is what the surrogate learns from.
+    assert lessons[1] > lessons[0] + 12 * 60
     summary = chain.summary
     assert summary.status == "converged"
     # Steps that were a lesson are burn-in: all evaluations are accounted for, to half a step of all walkers.
@@ -131,8 +159,8 @@ def test_a_posterior_with_two_hills_has_both_in_the_right_share() -> None:
 def test_a_surrogate_taught_by_wrong_lessons_costs_acceptance_and_nothing_else() -> None:
     """A surrogate that was taught the values of another target, displaced by 0.4 deviations in every direction.
 
-    Could go wrong: the chain samples the surrogate instead of the target. Holds: fewer proposals are accepted, and mean
-    and deviations are those of the target to 5 standard errors.
+    Could go wrong: the chain samples the surrogate instead of the target. Holds: fewer proposals are accepted, and
+    mean and deviations are those of the target to 5 standard errors.
     """
     target = Gaussian()
     wrong = Gaussian()
@@ -155,8 +183,8 @@ def test_a_surrogate_taught_by_wrong_lessons_costs_acceptance_and_nothing_else()
 def test_lessons_that_are_noise_leave_the_posterior_as_it_is() -> None:
     """A surrogate whose lessons are random numbers with a scatter of three in ln of the target.
 
-    Could go wrong: the walk leads to places that noise has raised, and stays there. Holds: proposals are still accepted,
-    and mean and deviations are those of the target to 5 standard errors.
+    Could go wrong: the walk leads to places that noise has raised, and stays there. Holds: proposals are still
+    accepted, and mean and deviations are those of the target to 5 standard errors.
     """
     target = Gaussian(3)
     random = np.random.RandomState(4)

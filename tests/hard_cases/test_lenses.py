@@ -32,10 +32,10 @@ def test_deflection_and_jacobian_are_right_to_twelve_digits_for_any_slope_and_fl
 ) -> None:
     """Slopes from 1.05 to 2.95, 2 and 2 +- 1e-12 among them; axis ratios from 0.05 to 1 - 1e-12 and 1.
 
-    Could go wrong: the series of the deflection converges as ((1 - q)/(1 + q))^k, and a fixed number of terms is wrong
-    by up to 3e-2 for flat lenses; formulas that divide by slope - 2 or 1 - q lose all digits where those vanish.
-    Holds: deflection and Jacobian are those of arithmetic with fifty digits, to 1e-12 of the deflection and to 1e-11 of
-    the largest derivative, from 1e-9 to 1000 arcsec from the centre.
+    Could go wrong: the series of the deflection converges as ((1 - q)/(1 + q))^k, and a fixed number of terms is
+    wrong by up to 3e-2 for flat lenses; formulas that divide by slope - 2 or 1 - q lose all digits where those
+    vanish. Holds: deflection and Jacobian are those of arithmetic with fifty digits, to 1e-12 of the deflection and
+    to 1e-11 of the largest derivative, from 1e-9 to 1000 arcsec from the centre.
     """
     lens = PowerLawLens(1.2, q, 0.4, slope)
     for x, y in fifty_digits.ring(9, 1e-9, 1e3):
@@ -52,8 +52,8 @@ def test_deflection_and_jacobian_are_right_to_twelve_digits_for_any_slope_and_fl
 def test_shear_and_an_offset_centre_keep_the_twelve_digits() -> None:
     """External shear, and a lens that does not stand at the origin.
 
-    Could go wrong: shear acts about the origin of the frame and the power law about its own centre; mixed up, both are
-    wrong by the offset. Holds: 1e-12 of the deflection against fifty digits.
+    Could go wrong: shear acts about the origin of the frame and the power law about its own centre; mixed up, both
+    are wrong by the offset. Holds: 1e-12 of the deflection against fifty digits.
     """
     for x, y in fifty_digits.ring(25, 0.05, 30.0):
         alpha = fifty_digits.deflection(SHEARED, x, y)
@@ -62,7 +62,9 @@ def test_shear_and_an_offset_centre_keep_the_twelve_digits() -> None:
         *derivatives, determinant = fifty_digits.jacobian(SHEARED, x, y)
         ours = [float(value[0]) for value in convergence_and_shear(SHEARED, one(x), one(y))]
         assert ours == pytest.approx(derivatives, rel=1e-11, abs=1e-12)
-        assert 1.0 / float(magnification(SHEARED, one(x), one(y))[0]) == pytest.approx(determinant, rel=1e-11, abs=1e-11)
+        assert 1.0 / float(magnification(SHEARED, one(x), one(y))[0]) == pytest.approx(
+            determinant, rel=1e-11, abs=1e-11
+        )
 
 
 def test_at_the_centre_of_the_lens_nothing_is_deflected_and_nothing_magnified() -> None:
@@ -85,8 +87,8 @@ def test_specifications_take_slopes_of_1_2_to_2_8_and_flattenings_to_0_05() -> N
     """A slope of 1.05 or 2.95, a flattening of 0.05 or of 0.04, asked for in a system of one's own.
 
     Could go wrong: a mass whose series hardly converges, or whose total hardly does, is simulated without a word.
-    Holds: slopes outside 1.2 to 2.8 and axis ratios below 0.05 are refused by their field; 0.05 is simulated, and the
-    light of its arcs is what the lens equation says.
+    Holds: slopes outside 1.2 to 2.8 and axis ratios below 0.05 are refused by their field; 0.05 is simulated, and
+    the light of its arcs is what the lens equation says.
     """
     plain = Realization(system=load_system("HE0435"), l_eta=1.0, host=Host(n=1.0, r_eff=0.002, magnitude=22.0))
     document = plain.to_dict()["system"]
@@ -169,10 +171,10 @@ def test_a_source_on_a_fold_has_its_two_images_in_one_and_beside_it_two_more_or_
 ) -> None:
     """A source on a fold, and 1e-10 to 1e-4 arcsec inside and outside.
 
-    Could go wrong: two images merge on the critical curve, where Newton's method stops anywhere within the square root
-    of rounding: one image is counted many times, or the pair is lost. Holds: on the fold the pair is one image; inside
-    there are two more than outside, of opposite parity and equal magnification, which grows as one over the root of
-    the distance; the images elsewhere are always there, and keep magnification and parity.
+    Could go wrong: two images merge on the critical curve, where Newton's method stops anywhere within the square
+    root of rounding: one image is counted many times, or the pair is lost. Holds: on the fold the pair is one
+    image; inside there are two more than outside, of opposite parity and equal magnification, which grows as one
+    over the root of the distance; the images elsewhere are always there, and keep magnification and parity.
     """
     lens = SHEARED.with_values(slope=slope)
     fold, inward = fold_and_inward(lens, angle)
@@ -197,9 +199,10 @@ def test_a_source_on_a_fold_has_its_two_images_in_one_and_beside_it_two_more_or_
 def test_a_source_on_a_cusp_has_its_three_images_in_one_and_beside_it_three_or_one(angle: float) -> None:
     """A source on a cusp, and 1e-6 to 1e-4 arcsec inside and outside along its axis.
 
-    Could go wrong: Newton's method stops anywhere within the cube root of rounding of the triple root; sixteen images
-    were found here once, and not the one that is far away. Holds: two images on the cusp and outside, four inside; the
-    far one is always there; inside the middle one of the three is as bright as both others, with the other parity.
+    Could go wrong: Newton's method stops anywhere within the cube root of rounding of the triple root; sixteen
+    images were found here once, and not the one that is far away. Holds: two images on the cusp and outside, four
+    inside; the far one is always there; inside the middle one of the three is as bright as both others, with the
+    other parity.
     """
     lens = PowerLawLens(1.0, 0.7, 0.0, 2.0)
     cusp = np.array(behind(lens, critical_point(lens, angle)))
@@ -224,8 +227,8 @@ def test_a_source_on_a_cusp_has_its_three_images_in_one_and_beside_it_three_or_o
 def test_two_images_are_born_on_crossing_the_astroid() -> None:
     """A source just inside and just outside the astroid, as that of SDSS1206 is.
 
-    Could go wrong: faint or merging images are lost, and the count changes elsewhere than on the caustic. Holds: four
-    images change to two within 3e-8 of the cusp of the astroid, at the place that the critical curve has.
+    Could go wrong: faint or merging images are lost, and the count changes elsewhere than on the caustic. Holds:
+    four images change to two within 3e-8 of the cusp of the astroid, at the place that the critical curve has.
     """
     lens = PowerLawLens(1.0, 0.7, 0.0, 2.0)
     cusp = behind(lens, critical_point(lens, 0.0))[0]
@@ -243,7 +246,8 @@ def test_a_source_behind_the_middle_of_a_round_lens_is_a_ring_and_refused() -> N
     """A point source exactly behind a round lens: its image is a ring, not points.
 
     Could go wrong: some points of the ring are returned as images, as many as the search happens to hit. Holds: a
-    LensEquationError that names the caustic; 1e-6 arcsec away there are the two images that an isothermal sphere has.
+    LensEquationError that names the caustic; 1e-6 arcsec away there are the two images that an isothermal sphere
+    has.
     """
     for slope in (1.7, 2.0, 2.3):
         with pytest.raises(LensEquationError, match="too close to a caustic"):
@@ -283,8 +287,8 @@ def test_all_images_behind_extreme_lenses_are_those_of_an_independent_solver(q: 
     """Lenses twenty times longer than wide, and slopes of 1.05 and 2.95: what the kernels take at most.
 
     Could go wrong: images are missed where the deflection varies over a twentieth of the distance from the lens.
-    Holds: for ten sources every image brighter than a hundredth that a solver of one-dimensional roots finds is there, at
-    the same place to 1e-9 arcsec, and every image maps back to its source to 1e-11.
+    Holds: for ten sources every image brighter than a hundredth that a solver of one-dimensional roots finds is
+    there, at the same place to 1e-9 arcsec, and every image maps back to its source to 1e-11.
     """
     lens, rng = PowerLawLens(1.0, q, 0.4, slope), np.random.default_rng(5)
     solver, compared = AngularSolver(lens), 0

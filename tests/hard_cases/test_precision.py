@@ -23,8 +23,8 @@ def test_the_sersic_profile_is_right_to_eleven_digits_from_its_cusp_to_its_wings
     """Sersic profiles of n = 0.3 to 10, from 1e-9 to 100 half-light radii, round and twenty times longer than wide.
 
     Could go wrong: approximations of k(n) are wrong by 1e-4 at n = 0.5 and diverge below; the cusp of n = 10 varies
-    over many decades within a pixel. Holds: brightness is that of fifty digits to 1e-11 of itself, or to 1e-300 where
-    the wings of n = 0.3 have no number in float64.
+    over many decades within a pixel. Holds: brightness is that of fifty digits to 1e-11 of itself, or to 1e-300
+    where the wings of n = 0.3 have no number in float64.
     """
     for q in (0.05, 0.7, 1.0):
         profile = SersicProfile(3.0, 0.4, n, q, 0.6, 0.1, -0.2)
@@ -42,8 +42,8 @@ def test_the_sersic_profile_is_right_to_eleven_digits_from_its_cusp_to_its_wings
 def test_evidence_and_source_are_those_of_fifty_digits_whatever_the_strength(ln_lambda: float) -> None:
     """The whole linear algebra of the evidence, from no regularisation (lambda = 4e-18) to nothing else (1e26).
 
-    Could go wrong: chi^2 and penalty, determinants and the marginalised amplitudes are differences of large numbers.
-    Holds: ln Z is right to 1e-9 (of values of 2000 to 6000) and the source to 1e-11 of its peak.
+    Could go wrong: chi^2 and penalty, determinants and the marginalised amplitudes are differences of large
+    numbers. Holds: ln Z is right to 1e-9 (of values of 2000 to 6000) and the source to 1e-11 of its peak.
     """
     scene, model = Explicit(columns=("agn", "background")), SourceModel((6, 6))
     design = np.hstack([scene.source_columns(model), scene.linear.columns])
@@ -80,9 +80,9 @@ def in_float32(scene: Explicit, lens: PowerLawLens, model: SourceModel, ln_lambd
 def test_the_evidence_in_float32_jumps_from_lens_to_lens_where_that_in_float64_is_right() -> None:
     """The solve in single precision of an arc a hundred times brighter than its noise, behind lenses 1e-6 arcsec apart.
 
-    Could go wrong: float32 is twice as fast and looks right. Holds: between lenses whose ln Z differs by less than 0.05
-    float32 scatters by more than 0.5, which is what a chain would see of its posterior; float64 agrees with matrices
-    written out to 1e-5 of ln Z's 1e6. The engine has no float32 for that reason.
+    Could go wrong: float32 is twice as fast and looks right. Holds: between lenses whose ln Z differs by less than
+    0.05 float32 scatters by more than 0.5, which is what a chain would see of its posterior; float64 agrees with
+    matrices written out to 1e-5 of ln Z's 1e6. The engine has no float32 for that reason.
     """
     scene, model = Explicit(), SourceModel((20, 20))
     scene.__dict__["linear"] = replace(scene.linear, covariance=1e-4 * scene.linear.covariance)
@@ -101,9 +101,9 @@ def test_the_evidence_in_float32_jumps_from_lens_to_lens_where_that_in_float64_i
 def test_rays_in_float32_lose_images_beside_a_fold_that_float64_finds() -> None:
     """A source 1e-8 arcsec inside a fold, its position rounded to float32.
 
-    Could go wrong: float32 knows 0.1 arcsec to 4e-9, and on a caustic that is the difference between four images and
-    two. Holds: in float64 the pair is there, its magnification as the root law has it to 5 %; of sources rounded to
-    float32 three of five have a magnification that is off by more than a tenth, or no pair.
+    Could go wrong: float32 knows 0.1 arcsec to 4e-9, and on a caustic that is the difference between four images
+    and two. Holds: in float64 the pair is there, its magnification as the root law has it to 5 %; of sources
+    rounded to float32 three of five have a magnification that is off by more than a tenth, or no pair.
     """
     off, law = 0, None
     for angle in (0.9, 1.1, 1.29, 3.9, 5.0):
@@ -121,8 +121,9 @@ def test_rays_in_float32_lose_images_beside_a_fold_that_float64_finds() -> None:
 def test_a_magnification_in_float32_is_wrong_by_more_than_a_tenth_beside_a_critical_curve() -> None:
     """The Jacobian 1e-7 theta_E beside a critical curve, at a position rounded to float32.
 
-    Could go wrong: the inverse magnification is a difference of numbers near one, of which float32 has seven digits.
-    Holds: float64 agrees with fifty digits to 1e-7, float32 is off by more than a tenth in three of five places.
+    Could go wrong: the inverse magnification is a difference of numbers near one, of which float32 has seven
+    digits. Holds: float64 agrees with fifty digits to 1e-7, float32 is off by more than a tenth in three of five
+    places.
     """
     wrong = 0
     for angle in (0.3, 0.9, 1.29, 2.2, 3.9):
@@ -139,8 +140,8 @@ def test_a_magnification_in_float32_is_wrong_by_more_than_a_tenth_beside_a_criti
 def test_the_evidence_refuses_rather_than_returns_what_even_float64_cannot_know() -> None:
     """A source of 900 pixels behind 336 data, with no regularisation to speak of.
 
-    Could go wrong: rounding leaves the matrix positive definite and the numbers mean nothing. Holds: an InversionError
-    that tells the condition number and what to change.
+    Could go wrong: rounding leaves the matrix positive definite and the numbers mean nothing. Holds: an
+    InversionError that tells the condition number and what to change.
     """
     with pytest.raises(InversionError, match="larger lambda"):
         ln_evidence(Explicit().likelihood(), LENS, -60.0, SourceModel((30, 30)))
