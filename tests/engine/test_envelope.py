@@ -8,7 +8,7 @@ import pytest
 
 from engine.imaging.drizzling import drizzle
 from engine.imaging.optics.extended import lensed_sersic_image
-from engine.lensing.power_law import kernel_arguments, source_position
+from engine.lensing.power_law import PowerLawLens, kernel_arguments, source_position
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.evidence import invert, ln_evidence
 from engine.likelihood.problem import prepare_problem
@@ -25,6 +25,7 @@ from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
 from tests.engine.dense_oracle import LENS, Case
+from tests.engine.plain_matrices import lensing_matrix
 
 MODEL = SourceModel(Analysis().source_pixels)
 
@@ -37,18 +38,26 @@ class Modulated(Case):
         profile = SersicProfile(1.0, 0.2, 2.0, 0.7, 0.6, 0.01, -0.02)
         self.rays = replace(self.rays, envelope=Envelope(profile, 0.05, 0.8, LENS, (0.03, 0.0)))
 
+    def lensing_matrix(self, lens: PowerLawLens, shape: tuple[int, int]) -> np.ndarray:
+        placed = map_rays(self.rays, kernel_arguments(lens), shape).envelope
+        assert placed is not None
+        return lensing_matrix(
+            self.rays, lens, shape, lambda x, y: surface_brightness(placed.profile, x, y) + placed.floor
+        )
+
 
 def test_evidence_and_source_are_those_of_explicit_matrices() -> None:
     case, model = Modulated(), SourceModel((9, 11))
     exact, solution, covariance = case.oracle(LENS, 1.0, model)
     inversion = invert(case.likelihood(), LENS, 1.0, model)
-    assert ln_evidence(case.likelihood(), LENS, 1.0, model) == pytest.approx(exact, rel=1e-8)
+    # The radial table of the envelope is good to 2e-7 of its centre.
+    assert ln_evidence(case.likelihood(), LENS, 1.0, model) == pytest.approx(exact, rel=1e-6)
     placed = map_rays(case.rays, kernel_arguments(LENS), model.shape).envelope
     assert placed is not None
     brightness = placed.on_cells(inversion.grid)
-    assert np.allclose(inversion.source.ravel(), solution[:99] * brightness, rtol=1e-8, atol=1e-8 * abs(solution).max())
+    assert np.allclose(inversion.source.ravel(), solution[:99] * brightness, rtol=1e-5, atol=1e-6 * abs(solution).max())
     expected = covariance[:99, :99] * np.outer(brightness, brightness)
-    assert np.allclose(inversion.source_covariance(), expected, rtol=1e-6, atol=1e-8 * expected.max())
+    assert np.allclose(inversion.source_covariance(), expected, rtol=1e-5, atol=1e-6 * expected.max())
 
 
 def test_the_curvature_is_that_of_the_brightness() -> None:

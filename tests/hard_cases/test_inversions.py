@@ -19,7 +19,8 @@ from engine.simulation.simulate import Simulation
 from engine.source.lensing_matrix import cast_rays, map_rays
 from engine.source.regularisation import SourceModel, regularisation_matrix
 from engine.spec.analysis import Analysis
-from tests.engine.explicit_inversion import LENS, Explicit, regularisation, stamp, stamp_likelihood
+from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_likelihood
+from tests.engine.plain_matrices import regularisation
 from tests.engine.true_fit import bare_fit, true_fit
 
 MODEL = SourceModel((11, 12))

@@ -13,7 +13,8 @@ from engine.lensing.power_law import PowerLawLens, magnification
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.evidence import invert, ln_evidence, normal_equations
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant
-from tests.engine.explicit_inversion import LENS, Explicit, regularisation
+from tests.engine.explicit_inversion import LENS, Explicit
+from tests.engine.plain_matrices import regularisation
 from tests.hard_cases import fifty_digits
 from tests.hard_cases.test_lenses import SHEARED, critical_point, fold_and_inward, one
 
