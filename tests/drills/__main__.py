@@ -120,16 +120,17 @@ def drill(
     """Put a promise of the service to the test, on a service of its own; exit code 1 if it does not hold."""
     logging.getLogger("alembic").setLevel(logging.WARNING)
     sizes = size or []
-    if any("=" not in changed for changed in sizes):
-        raise typer.BadParameter(f"sizes are given as name=value: {' '.join(sizes)}")
     try:
+        if any("=" not in changed for changed in sizes):
+            raise DrillError(f"sizes are given as name=value: {' '.join(sizes)}")
         if json_file is not None:
             require_file(json_file)
         if database_url is not None and database_url != "postgresql":
             preflight.require_database(read_settings(database_url=database_url))
         code = carry_out(Console(), name, sizes=sizes, small=small, database_url=database_url, json_file=json_file)
     except (DrillError, start.ConfigurationError) as error:
-        raise typer.BadParameter(str(error)) from error
+        typer.echo(f"{error}", err=True)
+        raise typer.Exit(start.CONFIGURATION) from error
     raise typer.Exit(code)
 
 
