@@ -73,9 +73,15 @@ def test_every_image_maps_back_to_the_source_and_parities_add_up() -> None:
         assert np.allclose(bx, x, rtol=0, atol=1e-11)
         assert np.allclose(by, y, rtol=0, atol=1e-11)
         parities = [1 if image.magnification > 0 else -1 for image in images]
-        # Burke's theorem without the central image, which the singular centre swallows for slope >= 2.
-        assert len(images) in {1, 2, 3, 4, 5}
-        assert sum(parities) in {-0, 0, 1}
+        # Burke's theorem: minima and maxima are one more than saddles. A slope of 2 and more swallows the maximum, and
+        # just below 2 it stands nearer to the centre than any number can say.
+        total, number = sum(parities), len(images)
+        if lens.slope > 2.0:
+            assert (total, number) in {(0, 2), (0, 4)}, (lens, x, y)
+        elif lens.slope < 1.9:
+            assert (total, number) in {(1, 1), (1, 3), (1, 5)}, (lens, x, y)
+        else:
+            assert (total, number) in {(0, 2), (0, 4), (1, 1), (1, 3), (1, 5)}, (lens, x, y)
 
 
 @pytest.mark.parametrize("name", system_names())
@@ -129,11 +135,13 @@ def any_lens(rng: np.random.Generator) -> PowerLawLens:
     )
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_all_images_parities_and_magnifications_are_those_of_an_independent_solver(part: int) -> None:
-    # 10,000 configurations in all, every other one within 1e-7 to 1e-2 theta_E of the tangential caustic.
+@pytest.mark.parametrize(
+    ("part", "number"), [(0, 500), *(pytest.param(part, 2500, marks=pytest.mark.long) for part in range(4))]
+)
+def test_all_images_parities_and_magnifications_are_those_of_an_independent_solver(part: int, number: int) -> None:
+    # 10,000 configurations in the long ones, every other within 1e-7 to 1e-2 theta_E of the tangential caustic.
     rng, found_by_both = np.random.default_rng([2017, part]), 0
-    for k in range(2500):
+    for k in range(number):
         lens = any_lens(rng)
         radius, angle = lens.theta_E * rng.uniform() ** 0.5, rng.uniform(0, 2 * math.pi)
         x, y = lens.x + radius * math.cos(angle), lens.y + radius * math.sin(angle)
@@ -158,4 +166,4 @@ def test_all_images_parities_and_magnifications_are_those_of_an_independent_solv
             assert abs(solver.source(image.x, image.y) - complex(x, y)) < 1e-11, where
             assert all(math.hypot(image.x - other.x, image.y - other.y) > 1e-5 * lens.theta_E for other in ours[:i])
         found_by_both += sum(abs(inverse) <= 100.0 for *_, inverse in theirs)
-    assert found_by_both > 2 * 2500  # the comparison is not empty
+    assert found_by_both > 2 * number  # the comparison is not empty

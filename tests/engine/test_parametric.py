@@ -16,7 +16,7 @@ from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.problem import CORE_BOOST, prepare_problem, ring_mask
-from engine.parametric.fit import GOOD_START, ParametricFit, _at_bound, _Finder, fit_parametric
+from engine.parametric.fit import GOOD_START, ParametricFit, _at_bound, _Finder
 from engine.parametric.lens_start import lens_from_positions
 from engine.parametric.model import ImageModel, Layout, lens_of, sersic_of
 from engine.parametric.point_sources import find_point_sources
@@ -25,11 +25,6 @@ from engine.parametric.starts import ring_radii
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
 from engine.spec.analysis import Analysis
-
-
-@pytest.fixture(scope="module")
-def fit(simulation: Simulation) -> ParametricFit:
-    return fit_parametric(simulation.observation, agn_images=4)
 
 
 def test_the_agn_images_are_found_within_a_tenth_of_a_pixel(scene: Scene, simulation: Simulation) -> None:
