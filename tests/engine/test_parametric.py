@@ -126,29 +126,6 @@ def test_what_a_fit_misses_is_noise_to_the_inversion_where_stars_are_stamps(
     assert np.array_equal(*(problem.likelihood.whitened.covariance for problem in exact))
 
 
-def test_the_noise_treatments_differ_as_they_say(simulation: Simulation, fit: ParametricFit) -> None:
-    observation = simulation.observation
-    paper = prepare_problem(observation, fit, Analysis(noise_treatment="paper_code"))
-    clear = ~paper.core[paper.mask]
-    expected = observation.noise**2 + 0.01 * np.abs(observation.image)
-    assert np.allclose(paper.likelihood.whitened.covariance[clear] ** 2, expected[paper.mask][clear])
-    full = prepare_problem(observation, fit, Analysis(noise_treatment="covariance"))
-    factor = full.likelihood.whitened.covariance
-    assert factor.shape == (paper.mask.sum(),) * 2
-    variance = (factor**2).sum(axis=1)
-    assert np.allclose(variance[clear], observation.noise[paper.mask][clear] ** 2, rtol=1e-6)
-    with pytest.raises(ObservationError, match="covariance"):
-        prepare_problem(replace(observation, covariance=None), fit, Analysis(noise_treatment="covariance"))
-
-
-def test_a_ring_without_valid_pixels_is_refused(simulation: Simulation, fit: ParametricFit) -> None:
-    observation = simulation.observation
-    corner = np.zeros(observation.shape, dtype=bool)
-    corner[0, 0] = True
-    with pytest.raises(ObservationError, match="mask"):
-        prepare_problem(replace(observation, valid=corner), fit, Analysis(noise_treatment="diagonal"))
-
-
 def _lensed(observation: Observation, *, shear: bool = False) -> tuple[ImageModel, np.ndarray]:
     """A model of a host's arc and a deflector, without AGN, on an image of its own; and its parameters."""
     layout = Layout(0, deflector=True, shear=shear)

@@ -15,7 +15,7 @@ from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.evidence import ln_evidence
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.target import Target, wide_prior
-from engine.run import Truth, analysis_of
+from engine.run import Measurement, Truth, analysis_of
 from engine.source.regularisation import SourceModel
 from engine.spec.priors import ParameterPrior
 from engine.spec.realization import realization_from_dict
@@ -141,23 +141,29 @@ def test_every_system_states_its_priors_and_they_hold_its_models(name: str) -> N
     assert {"theta_E", "q", "slope"} <= set(system.priors)
 
 
-def test_priors_and_positions_narrow_the_posterior() -> None:
+def measured(**asked: object) -> Measurement:
     simulation = simulate_realization(realization())
-    sd = {}
-    for name, asked in (
-        ("plain", {}),
-        ("told", {"priors": {"slope": ParameterPrior(mean=2.0, sd=0.002)}, "agn_position_sd": 0.002}),
-    ):
-        found = measure(
-            simulation.observation,
-            realization(**asked).analysis,
-            np.random.default_rng(1),
-            agn_images=len(simulation.scene.agn),
-        )
-        sd[name] = {p.name: p.value.sd for p in found.lens}
-    assert sd["told"]["slope"] == pytest.approx(0.002, rel=0.4)
-    assert sd["told"]["slope"] < 0.5 * sd["plain"]["slope"]
-    assert sd["told"]["theta_E"] < sd["plain"]["theta_E"]
+    return measure(
+        simulation.observation,
+        realization(**asked, draws=10, max_steps=60).analysis,
+        np.random.default_rng(1),
+        agn_images=len(simulation.scene.agn),
+        truth=Truth(simulation.scene.lens, simulation.scene.host),
+    )
+
+
+@pytest.fixture(scope="module")
+def plain() -> Measurement:
+    """Without priors, positions or a known background."""
+    return measured()
+
+
+def test_priors_and_positions_narrow_the_posterior(plain: Measurement) -> None:
+    told = measured(priors={"slope": ParameterPrior(mean=2.0, sd=0.002)}, agn_position_sd=0.002)
+    without, sd = ({p.name: p.value.sd for p in found.lens} for found in (plain, told))
+    assert sd["slope"] == pytest.approx(0.002, rel=0.4)
+    assert sd["slope"] < 0.5 * without["slope"]
+    assert sd["theta_E"] < without["theta_E"]
 
 
 def test_a_run_takes_the_systems_priors_where_it_states_none() -> None:
@@ -167,19 +173,10 @@ def test_a_run_takes_the_systems_priors_where_it_states_none() -> None:
     assert analysis_of(realization()).priors == load_system(SYSTEM).priors
 
 
-def test_a_known_background_is_held_and_gives_the_host_its_wings_back() -> None:
+def test_a_known_background_is_held_and_gives_the_host_its_wings_back(plain: Measurement) -> None:
     """The simulation's sky is taken off exactly. A free background of the ring takes 0.3 mag of `paper`'s host."""
-    simulation = simulate_realization(realization())
     bias = {}
-    for name, sd in (("free", None), ("known", 1e-3)):
-        analysis = realization(background_sd=sd, draws=10, max_steps=60).analysis
-        found = measure(
-            simulation.observation,
-            analysis,
-            np.random.default_rng(1),
-            agn_images=len(simulation.scene.agn),
-            truth=Truth(simulation.scene.lens, simulation.scene.host),
-        )
+    for name, found in (("free", plain), ("known", measured(background_sd=1e-3))):
         paper = next(e for e in found.estimates if (e.estimator, e.index_prior) == ("paper", "wide"))
         bias[name] = paper.magnitude.bias
     assert bias["free"] is not None

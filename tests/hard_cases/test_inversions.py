@@ -20,7 +20,7 @@ from engine.source.lensing_matrix import cast_rays, map_rays
 from engine.source.regularisation import SourceModel, regularisation_matrix
 from engine.spec.analysis import Analysis
 from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_likelihood
-from tests.engine.plain_matrices import regularisation
+from tests.engine.plain_matrices import lensing_matrix, regularisation
 from tests.engine.true_fit import bare_fit, true_fit
 
 MODEL = SourceModel((11, 12))
@@ -271,8 +271,7 @@ def test_a_mask_of_one_pixel_has_the_evidence_of_one_gaussian(subrays: int) -> N
             invert(likelihood, LENS, 0.0, model)
         return
     found = invert(likelihood, LENS, 0.0, model)
-    # Four rays at the corners of the grid, each a quarter of the pixel's area.
-    share, prior = np.full(4, 0.01 / 4), np.linalg.inv(regularisation(model))
+    share, prior = lensing_matrix(rays, LENS, model.shape)[0], np.linalg.inv(regularisation(model))
     variance = 0.01 + share @ prior @ share
     assert found.ln_evidence == pytest.approx(-0.5 / variance - 0.5 * math.log(2 * math.pi * variance), abs=1e-10)
     assert np.allclose(found.source.ravel(), prior @ share / variance, rtol=1e-8)
