@@ -49,10 +49,13 @@ def lensing_matrix(
     """L (P, ny nx): the light of each pixel with rays in terms of the source's nodes (ratios to an envelope)."""
     per_pixel = rays.subrays**2
     x, y = (values.reshape(-1, per_pixel) for values in traced(lens, rays.x, rays.y))
-    across = hats(nodes_round(x[rays.in_mask], shape[1]), x)
-    up = hats(nodes_round(y[rays.in_mask], shape[0]), y)
+    columns, rows = nodes_round(x[rays.in_mask], shape[1]), nodes_round(y[rays.in_mask], shape[0])
+    light = np.ones(x.shape)
     if envelope is not None:
-        up = up * envelope(x, y)[..., None]
+        # Beyond the grid the source goes on as its envelope does.
+        light = envelope(x, y)
+        x, y = np.clip(x, columns[0], columns[-1]), np.clip(y, rows[0], rows[-1])
+    across, up = hats(columns, x), hats(rows, y) * light[..., None]
     return np.einsum("pri,prj->pij", up, across).reshape(x.shape[0], -1) * rays.pixel_area / per_pixel
 
 
