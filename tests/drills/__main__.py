@@ -26,7 +26,7 @@ from tests.drills.kills import DispatcherKills, SchedulerKills, WorkerKills
 from tests.drills.outages import DiskFull, PostgresKills, SqliteLock
 from tests.drills.remote import TwoWorkers
 from tests.drills.rivals import Poison, StoppedWorker, TwoDispatchers
-from tests.drills.scale import Overhead, Throughput
+from tests.drills.scale import Breadth, Overhead, Throughput
 from tests.drills.stores import StoreAway
 from tests.drills.users import Cancel, Idempotency
 from tests.drills.volume import Listing, Submission
@@ -50,6 +50,7 @@ DRILLS: dict[str, type[Drill]] = {
         Cancel,
         Idempotency,
         Throughput,
+        Breadth,
         Submission,
         Listing,
         Overhead,

@@ -13,7 +13,7 @@ import psutil
 
 from service.store.migrate import upgrade
 from tests.drills.drill import Drill, Ground, body
-from tests.drills.installation import Installation, installation, is_worker
+from tests.drills.installation import DrillError, Installation, free_port, installation, is_worker
 from tests.drills.postgres import PostgresServer
 from tests.drills.remote import working_time
 from tests.drills.report import Claim, Figure, Report, quantile
@@ -185,5 +185,71 @@ class Overhead(Drill):
             (
                 Claim(f"{self.runs} runs done, each stored once", found.stored == self.runs),
                 Claim("overhead below 2 %", share < 0.02),
+            ),
+        )
+
+
+@dataclass(frozen=True)
+class Breadth(Drill):
+    """As many workers as a cluster has, and the dispatcher on one core."""
+
+    name: ClassVar[str] = "breadth"
+    what: ClassVar[str] = "1,000 worker threads with runs of 10 s; the dispatcher has one core"
+    claim: ClassVar[str] = "100 runs/s stored: < 10 ms of the dispatcher's CPU a run"
+    small: ClassVar[dict[str, object]] = {"runs": 200, "threads": 20, "sleep_s": 1.0}
+
+    runs: int = 5000
+    threads: int = 1000
+    processes: int = 4
+    """The threads are shared out among so many; what sleeps in one of them costs as little as elsewhere."""
+    sleep_s: float = 10.0
+
+    def run(self, ground: Ground) -> Report:
+        """Work off one grid on a scheduler and workers apart; what each process spends on it."""
+        port = free_port()
+        address = f"tcp://127.0.0.1:{port}"
+        settings = {
+            "HOSTLENS_SCHEDULER_ADDRESS": address,
+            "HOSTLENS_DRILL_SLEEP": str(self.sleep_s),
+            "HOSTLENS_RECONCILE_S": "10",
+        }
+        with timed(ground, settings) as service:
+            listen = ("--host", "127.0.0.1", "--port", str(port), "--health", "127.0.0.1:0")
+            service.start("service", "scheduler", *listen)
+            each = str(self.threads // self.processes)
+            room = (address, "--nthreads", each, "--no-nanny", "--no-dashboard", "--memory-limit", "0")
+            preload = ("--preload", "service.runtime.logs")
+            for _ in range(self.processes):
+                service.start("service.dispatcher.dask_command", "worker", *room, *preload)
+            service.wait_ready(int(each) * self.processes)
+            dispatcher = service.child("tests.drills.timed_dispatcher")
+            if dispatcher is None:
+                raise DrillError("the dispatcher is gone")
+            dispatcher.cpu_affinity([max(os.sched_getaffinity(0))])
+            before = dispatcher.cpu_times()
+            grid = service.client.submit(body(self.runs))
+            service.watch(grid.id, every_s=2.0, timeout_s=3600)
+            after = dispatcher.cpu_times()
+            took = working_time(service, grid.id)
+            spent = after.user + after.system - before.user - before.system
+            found, claims, load = records(service, grid.id), claim_times(service), os.getloadavg()[0]
+        threads = int(each) * self.processes
+        alone = self.sleep_s * self.runs / threads
+        return Report(
+            self.name,
+            f"{self.runs} runs of {self.sleep_s:g} s, {threads} threads in {self.processes} processes, {ground.backend}",
+            (
+                Figure("first start to last end", took, "s"),
+                Figure("the runs alone", alone, "s"),
+                Figure("rate", self.runs / took, "runs/s"),
+                Figure("CPU a run, dispatcher", 1e3 * spent / self.runs, "ms"),
+                Figure("runs a second of the dispatcher's core", self.runs / spent, "runs/s"),
+                Figure("claims", len(claims)),
+                Figure("claim, median", 1e3 * quantile(claims, 0.5), "ms"),
+                Figure("load of the machine at the end", load),
+            ),
+            (
+                Claim(f"{self.runs} runs done, each stored once", found.stored == self.runs),
+                Claim("less than 10 ms of the dispatcher's CPU a run", spent < 0.01 * self.runs),
             ),
         )
