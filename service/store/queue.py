@@ -317,18 +317,11 @@ class RunQueue:
     def _later_than(now: datetime, delay: timedelta) -> ColumnElement[bool]:
         return run.c.not_before > now + _SLACK + delay * _JITTER[1]
 
-    def to_hold(self, generation: int) -> set[Pair]:
-        """Runs leased in this generation whose grid has been paused, each with its token."""
-        return self._leased_where(generation, grid.c.paused_at.is_not(None))
-
     def to_cancel(self, generation: int) -> set[Pair]:
         """Runs leased in this generation whose grid has been cancelled, each with its token."""
-        return self._leased_where(generation, grid.c.cancelled_at.is_not(None))
-
-    def _leased_where(self, generation: int, condition: ColumnElement[bool]) -> set[Pair]:
         with self._database.read() as connection:
-            called = run.c.grid_id.in_(select(grid.c.id).where(condition, _OPEN))
-            return self._leased_now(connection, generation, called)
+            cancelled = select(grid.c.id).where(grid.c.cancelled_at.is_not(None), _OPEN)
+            return self._leased_now(connection, generation, run.c.grid_id.in_(cancelled))
 
     @staticmethod
     def _leased_now(connection: Connection, generation: int, *where: ColumnElement[bool]) -> set[Pair]:

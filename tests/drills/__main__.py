@@ -30,7 +30,7 @@ from tests.drills.scale import Breadth, Overhead, Throughput
 from tests.drills.stores import StoreAway
 from tests.drills.users import Cancel, Idempotency
 from tests.drills.volume import Listing, Submission
-from tests.drills.workers import Lifetime, SilentWorker
+from tests.drills.workers import SilentWorker
 
 DRILLS: dict[str, type[Drill]] = {
     drill.name: drill
@@ -44,7 +44,6 @@ DRILLS: dict[str, type[Drill]] = {
         StoreAway,
         StoppedWorker,
         SilentWorker,
-        Lifetime,
         TwoDispatchers,
         Poison,
         Cancel,

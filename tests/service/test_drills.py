@@ -25,7 +25,7 @@ from tests.drills.scale import Overhead, Throughput
 from tests.drills.stores import StoreAway
 from tests.drills.users import Cancel, Idempotency
 from tests.drills.volume import Listing, Submission
-from tests.drills.workers import Lifetime, SilentWorker
+from tests.drills.workers import SilentWorker
 from tests.service.plans import submit
 
 
@@ -55,9 +55,8 @@ def _is_at(process: psutil.Process, folder: Path) -> bool:
         StoreAway(runs=12, away_s=2.0),
         StoppedWorker(runs=6, deadline_s=3.0),
         SilentWorker(runs=6),
-        Lifetime(runs=40, lifetime_s=2.0),
         TwoDispatchers(runs=20),
-        Poison(runs=24, batch=4),
+        Poison(runs=24),
         Cancel(runs=1000),
         Idempotency(clients=20, runs=20),
     ],

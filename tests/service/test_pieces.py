@@ -485,7 +485,6 @@ LOOKS: dict[str, Callable[[Database, int], object]] = {
     "waiting": lambda database, _: RunQueue(database).waiting("e" * 64),
     "forgotten": lambda database, generation: RunQueue(database).requeue_forgotten(generation, []),
     "to cancel": lambda database, generation: RunQueue(database).to_cancel(generation),
-    "to hold": lambda database, generation: RunQueue(database).to_hold(generation),
     "post-dated": lambda database, _: RunQueue(database).release_postdated(),
     "depth": lambda database, _: QueueDepth(database).look(),
     "upkeep": lambda database, _: Upkeep(database).step(),
