@@ -247,7 +247,7 @@ def test_a_run_alone_on_a_worker_that_died_is_charged_and_tried_again_alone(data
     setting.run()
     assert setting.grids.grid(setting.grid_id).counts.done == 4
     assert outcomes(setting) == [["worker_lost", "done"], ["done"], ["done"], ["done"]]
-    assert [lease.suspect for _, lease in pool.placed] == [False] * 4 + [True]
+    assert [lease.attempt for _, lease in pool.placed if lease.suspect] == [2]
 
 
 def test_runs_that_shared_a_dead_worker_are_charged_nothing_and_run_one_at_a_time_alone(

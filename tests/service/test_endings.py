@@ -349,11 +349,10 @@ def test_suspects_of_two_engines_take_turns_and_neither_clears_the_other_s_lane(
     served: list[str] = []
     submits = pool.submit
 
-    def noted(leases: Sequence[Lease], worker: Any) -> Any:
+    def noted(lease: Lease, worker: Any) -> Any:
         served.append(worker.engine[:1])
-        future = submits(leases, worker)
-        answers = [{**answer, "engine": worker.engine} for answer in json.loads(future._answers)["answers"]]
-        future._answers = to_bytes({"answers": answers})
+        future = submits(lease, worker)
+        future._answers = to_bytes({"answer": {**json.loads(future._answers)["answer"], "engine": worker.engine}})
         return future
 
     pool.submit = noted  # type: ignore[method-assign]
