@@ -44,8 +44,8 @@ from engine import (
     system_facts,
     system_names,
 )
+from service.domain.plan import PlannedRun
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
-from service.store.submission import PlannedRun
 
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -230,7 +230,6 @@ def _system_fields(name: str) -> dict[str, Any]:
         "name": name,
         "camera": system.camera_name,
         "mass_models": {model: sorted(map(float, slopes)) for model, slopes in system.mass_models.items()},
-        "links": {"self": f"/v1/systems/{name}"},
     }
 
 

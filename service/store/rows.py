@@ -1,4 +1,4 @@
-"""Rows as the API's models."""
+"""Rows as the domain's views."""
 
 from __future__ import annotations
 
@@ -60,13 +60,6 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         paused_at=row.paused_at,
         engine_digest=row.engine_digest,
         request=row.request,
-        links={
-            "self": f"/v1/grids/{row.id}",
-            "runs": f"/v1/grids/{row.id}/runs",
-            "summary": f"/v1/grids/{row.id}/summary",
-            "events": f"/v1/grids/{row.id}/events",
-            **{action: f"/v1/grids/{row.id}/{action}" for action in ("cancel", "pause", "resume", "retry")},
-        },
     )
 
 
@@ -93,15 +86,11 @@ def run_view(row: Row[Any]) -> RunView:
 
 def run_detail(row: Row[Any], found: Row[Any] | None, attempts: Sequence[Row[Any]]) -> RunDetail:
     """A run with all that belongs to it."""
-    fields = _run_fields(row)
-    result = None if found is None else result_view(found)
-    if result is not None and result.figure is not None:
-        fields["links"]["figure"] = f"/v1/runs/{row.id}/figure"
     return RunDetail(
-        **fields,
+        **_run_fields(row),
         spec=row.spec,
         digest=row.digest,
-        result=result,
+        result=None if found is None else result_view(found),
         attempts=[
             AttemptView(**{name: getattr(ended, name) for name in AttemptView.model_fields}) for ended in attempts
         ],
@@ -162,5 +151,4 @@ def _run_fields(row: Row[Any]) -> dict[str, Any]:
         "state": state,
         "uws_phase": UWS_PHASES[state],
         "error": error,
-        "links": {"self": f"/v1/runs/{row.id}", "grid": f"/v1/grids/{row.grid_id}"},
     }
