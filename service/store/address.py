@@ -87,8 +87,8 @@ def read_address(text: str) -> SqliteAddress | PostgresAddress:
         Another kind of database, or an option that is unknown or has no such value.
     """
     # What follows a NUL the drivers' C code does not see: the host, say.
-    if "\x00" in unquote(text) or not _is_unicode(text):
-        raise AddressError("the database URL has a NUL or what is no Unicode")
+    if "\x00" in unquote(text) or not text.isprintable():  # as no lone surrogate is
+        raise AddressError("the database URL has a character that cannot be printed")
     several = _HOSTS.fullmatch(text)
     try:
         url = make_url(text if several is None else several["before"] + (several["after"] or ""))
@@ -174,14 +174,6 @@ def _require_ports(ports: list[str]) -> None:
     for port in ports:
         if port and not (re.fullmatch(r"[0-9]{1,5}", port) and 0 < int(port) < 65536):
             raise AddressError(f"the database URL has the port {port[:80]!r}; one of 1 to 65535 is expected")
-
-
-def _is_unicode(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _once(name: str, value: str | tuple[str, ...]) -> str:
