@@ -74,6 +74,9 @@ class Installation:
         Variables of this process that the others do not inherit.
     """
 
+    cwd: Path | None = None
+    """Where the processes are at home; where this one is, without."""
+
     def __init__(
         self,
         folder: Path,
@@ -82,7 +85,7 @@ class Installation:
         without: Collection[str] = (),
     ) -> None:
         self.folder = folder
-        self.port = free_port()
+        self.port = int(settings.get("HOSTLENS_PORT", 0)) or free_port()
         self.log = folder / "serve.log"
         # Every process of this service, and of no other, has this in its environment.
         self._mark = f"hostlens-{self.port}-{time.time_ns()}"
@@ -114,7 +117,7 @@ class Installation:
         with self.log.open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", module, *arguments],
-                cwd=self.folder,
+                cwd=self.cwd,
                 env={**self.environment, PARENT_FD: str(self._pipe[0]), **changes},
                 pass_fds=(self._pipe[0],),
                 stdin=subprocess.DEVNULL,
@@ -122,17 +125,14 @@ class Installation:
                 stderr=log,
             )
 
-    def wait_ready(self, workers: int = 1, timeout_s: float = 90.0) -> Readiness:
+    def wait_ready(self, workers: int = 1, timeout_s: float = 90.0) -> None:
         """Wait until it computes with at least so many worker threads."""
+        eventually(lambda: self.is_ready(workers), timeout_s, "readiness")
 
-        def look() -> Readiness | None:
-            found = self.readiness()
-            return found if found is not None and found.status == "ready" and found.workers >= workers else None
-
-        found = eventually(look, timeout_s, "readiness")
-        if found is None:  # pragma: no cover - eventually raises instead
-            raise DidNotHappenError("not ready")
-        return found
+    def is_ready(self, workers: int = 1) -> bool:
+        """Whether it computes with at least so many worker threads."""
+        found = self.readiness()
+        return found is not None and found.status == "ready" and found.workers >= workers
 
     def readiness(self) -> Readiness | None:
         """What /readyz says, None where it does not answer with 200."""

@@ -22,6 +22,7 @@ class Installation(runtime.Installation):
     def __init__(
         self, folder: Path, settings: Mapping[str, str], commands: Sequence[tuple[str, ...]] = (("service", "serve"),)
     ) -> None:
+        self.cwd = folder
         self.executions = folder / "executions"
         self.executions.touch()
         # The processes are started elsewhere, and have to find the tasks of the tests.
