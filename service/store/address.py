@@ -16,6 +16,8 @@ _SQLITE, _POSTGRES = (
     frozenset({"postgresql", "postgres", "postgresql+psycopg"}),
 )
 _SQLITE_OPTIONS = {"uri": {"true", "1"}, "mode": {"ro", "rw"}, "immutable": {"0", "1"}, "nolock": {"0", "1"}}
+_SURROGATE = re.compile("[\ud800-\udfff]")
+"""Half a character, which stands for bytes that are no text."""
 _HOSTS = re.compile(r"(?P<before>[\w+]+://(?:[^@]*@)?)(?P<hosts>[^@/?]*,[^@/?]*)(?P<after>[/?].*)?", re.DOTALL)
 _HOST = re.compile(r"(?P<host>\[[^\]]*\]|[^:]*)(?::(?P<port>\d*))?")
 _NUMBERS = frozenset(
@@ -87,8 +89,8 @@ def read_address(text: str) -> SqliteAddress | PostgresAddress:
         Another kind of database, or an option that is unknown or has no such value.
     """
     # What follows a NUL the drivers' C code does not see: the host, say.
-    if "\x00" in unquote(text) or not text.isprintable():  # as no lone surrogate is
-        raise AddressError("the database URL has a character that cannot be printed")
+    if "\x00" in unquote(text) or _SURROGATE.search(text):
+        raise AddressError("the database URL has a NUL or what is no Unicode")
     several = _HOSTS.fullmatch(text)
     try:
         url = make_url(text if several is None else several["before"] + (several["after"] or ""))
