@@ -159,9 +159,10 @@ def _add_inputs():
         row["digest"] = _input_digest({name: row[name] for name in KEY})
     for first in range(0, len(rows), AT_ONCE):
         op.get_bind().execute(into.insert(), rows[first : first + AT_ONCE])
-    same = " and ".join(f"input.{name} is not distinct from result.{name}" for name in ("regularisation", "profile"))
-    alike = " and ".join(f"input.{name} = result.{name}" for name in ("grid_id", *KEY) if name not in same)
-    _execute(f"update result set input_id = (select id from input where {alike} and {same})")  # noqa: S608
+    nullable = ("regularisation", "profile")
+    alike = [f"input.{name} = result.{name}" for name in ("grid_id", *KEY) if name not in nullable]
+    alike += [f"coalesce(input.{name}, '') = coalesce(result.{name}, '')" for name in nullable]
+    _execute(f"update result set input_id = (select id from input where {' and '.join(alike)})")  # noqa: S608
 
 
 def _create_tables():
