@@ -78,17 +78,19 @@ def _quiet(*tables):
     inspector = sa.inspect(op.get_bind())
     for table in tables:
         names = [column["name"] for column in inspector.get_columns(table)]
-        changes = ", ".join(
-            f"ALTER COLUMN {name} SET STATISTICS 0" for name in names if name not in LOOKED_FOR[table]
-        )
+        changes = ", ".join(f"ALTER COLUMN {name} SET STATISTICS 0" for name in names if name not in LOOKED_FOR[table])
         _execute(f"ALTER TABLE {table} {changes}")
 
 
 def _configuration():
     """What a lens with two or four AGN images is called, by an expression over a row of run."""
-    system, own = ("json_extract(spec, '$.system')", "json_array_length(spec, '$.system.agn')") if _on_sqlite() else (
-        "spec ->> 'system'",
-        "json_array_length(spec -> 'system' -> 'agn')",
+    system, own = (
+        ("json_extract(spec, '$.system')", "json_array_length(spec, '$.system.agn')")
+        if _on_sqlite()
+        else (
+            "spec ->> 'system'",
+            "json_array_length(spec -> 'system' -> 'agn')",
+        )
     )
     kind = "json_type(spec, '$.system')" if _on_sqlite() else "json_typeof(spec -> 'system')"
     quads, doubles = (", ".join(f"'{name}'" for name in names) for names in (QUADS, DOUBLES))
@@ -150,7 +152,7 @@ def _input_digest(values):
 
 def _add_inputs():
     columns = ", ".join(("grid_id", *KEY))
-    counted = f"select {columns}, count(*) as runs, sum(wall_s) as wall_s, sum(cpu_s) as cpu_s"  # noqa: S608
+    counted = f"select {columns}, count(*) as runs, sum(wall_s) as wall_s, sum(cpu_s) as cpu_s"
     found = op.get_bind().execute(sa.text(f"{counted} from result group by {columns} order by {columns}"))
     names = ("grid_id", "digest", *KEY, "runs", "wall_s", "cpu_s")
     into = sa.table("input", *(sa.column(name) for name in names))
@@ -213,11 +215,7 @@ def _create_tables():
             sa.Column("estimator", sa.String(16), nullable=False),
             sa.Column("index_prior", sa.String(16), nullable=False),
             *(sa.Column(name, sa.BigInteger(), nullable=False) for name in COUNTED),
-            *(
-                sa.Column(f"{quantity}_{part}", _kind(part), nullable=False)
-                for quantity in SUMMED
-                for part in parts
-            ),
+            *(sa.Column(f"{quantity}_{part}", _kind(part), nullable=False) for quantity in SUMMED for part in parts),
             sa.ForeignKeyConstraint([f"{owner}_id"], [f"{owner}.id"], name=f"fk_{owner}_moments_{owner}_id"),
             sa.PrimaryKeyConstraint(f"{owner}_id", "estimator", "index_prior", name=f"pk_{owner}_moments"),
         )

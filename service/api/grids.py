@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import logging
 from itertools import islice
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic_core import to_json
 
 from engine import engine_digest
-from service.api.artefacts import artefact
 from service.api.bodies import JsonRoute
 from service.api.context import GridId, Limit, RunId, Service
+from service.api.downloads import artefact
 from service.api.pages import next_link
 from service.api.threads import patient
-from service.identifiers import GRID_PATTERN
-from service.requests import GridRequest, plan
-from service.schemas import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
+from service.domain.identifiers import GRID_PATTERN
+from service.domain.requests import GridRequest, plan
+from service.domain.states import RunState
+from service.domain.views import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
 from service.store.grids import NotFoundError
-from service.store.states import RunState
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
 _LOG = logging.getLogger(__name__)
@@ -105,8 +105,12 @@ def summary(
     """Recovered values and biases by input, and over the whole grid."""
     found = service.grids.summary(grid_id, limit, cursor)
     found["next"] = next_link(request, response, found["next"])
-    # Written at once: by way of the model every number of the page would be checked before.
-    return Response(to_json(found), media_type="application/json", headers=dict(response.headers))
+    return _written(found, dict(response.headers))
+
+
+def _written(document: Any, headers: dict[str, str] | None = None) -> Response:
+    """Plain data, written at once: by way of its model every number would be checked before."""
+    return Response(to_json(document), media_type="application/json", headers=headers)
 
 
 @router.post("/grids/{grid_id}/cancel")
@@ -134,10 +138,10 @@ def retry(grid_id: GridId, service: Service) -> GridView:
     return service.grids.grid(grid_id)
 
 
-@router.get("/runs/{run_id}")
-def show_run(run_id: RunId, service: Service) -> RunDetail:
+@router.get("/runs/{run_id}", response_model=RunDetail)
+def show_run(run_id: RunId, service: Service) -> Response:
     """One run: specification, state, result, attempts."""
-    return service.grids.run(run_id)
+    return _written(service.grids.run_document(run_id))
 
 
 @router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]

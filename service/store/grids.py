@@ -12,18 +12,14 @@ from typing import Any
 from sqlalchemy import Connection, Row, bindparam, false, func, select, update
 from sqlalchemy.exc import IntegrityError
 
-from service.identifiers import utc_now
-from service.schemas import GridPage, GridView, RunDetail, RunPage
+from service.domain.identifiers import utc_now
+from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
+from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent
 from service.store.pieces import Turns
-from service.store.settling import IS_OPEN, settle
-from service.store.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
-from service.store.submission import Plan, Submission, give_up, store
-from service.store.summary import summarise
-from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
-from service.store.views import (
+from service.store.rows import (
     ATTEMPT_COLUMNS,
     ESTIMATE_COLUMNS,
     RUN_COLUMNS,
@@ -32,6 +28,10 @@ from service.store.views import (
     run_document,
     run_view,
 )
+from service.store.settling import IS_OPEN, settle
+from service.store.submission import Plan, Submission, give_up, store
+from service.store.summary import summarise
+from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""

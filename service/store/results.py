@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
-from service.payload import (
+from service.domain.payload import (
     COUNTS,
     ESTIMATES,
     LENS_PARAMETERS,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, bindparam, select
 
-from service.payload import ESTIMATES, estimator_and_prior
-from service.schemas import GridView
+from service.domain.payload import ESTIMATES, estimator_and_prior
+from service.domain.views import GridView
 from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_moments, input_group, input_moments
 
 _PARTS = ("shift", "shift2", "sd", "bias", "bias_runs")
@@ -37,10 +37,11 @@ _TRUE = [GROUP_COLUMNS.index(quantity) for quantity in SUMMED]
 def summarise(connection: Connection, grid: GridView, limit: int, offset: int = 0) -> dict[str, Any]:
     """Rows by input (all but the seed) and the whole grid, in the transaction that read the grid.
 
-    The answer is a :class:`service.schemas.Summary` as plain data, keys in the order of the models' fields. A page can
+    The answer is a :class:`~service.domain.views.Summary` as plain data, keys in the order of the fields. A page can
     hold two hundred thousand numbers: models of them take longer to make than all the rest, only to check what this
     module has written. ``next`` holds the offset of the next page of rows.
     """
+    stored = grid.counts.done
     page = {"grid": grid.id, "limit": limit + 1, "offset": offset}
     found = connection.execute(_INPUTS, page).all()
     whole = {(row.estimator, row.index_prior): row for row in connection.execute(_WHOLE, {"grid": grid.id})}
@@ -48,15 +49,15 @@ def summarise(connection: Connection, grid: GridView, limit: int, offset: int = 
         "grid_id": grid.id,
         "state": grid.state,
         "n_runs": grid.n_runs,
-        "n_stored": grid.counts.done,
+        "n_stored": stored,
         "rows": _rows(connection, found[:limit]) if found else [],
-        "overall": {name: _overall(whole.get(estimator_and_prior(name))) for name in ESTIMATES} if grid.counts.done else {},
+        "overall": {name: _overall(whole.get(estimator_and_prior(name))) for name in ESTIMATES} if stored else {},
         "next": str(offset + limit) if len(found) > limit else None,
     }
 
 
 def _rows(connection: Connection, inputs: Sequence[Row[Any]]) -> list[dict[str, Any]]:
-    """Each a :class:`service.schemas.SummaryRow` as plain data."""
+    """Each a :class:`service.domain.views.SummaryRow` as plain data."""
     places = {row.id: place for place, row in enumerate(inputs)}
     answers: list[dict[str, Any] | None] = [None] * (len(inputs) * len(ESTIMATES))
     rows = connection.execute(_MOMENTS, {"inputs": list(places)}).all()
@@ -78,7 +79,7 @@ def _rows(connection: Connection, inputs: Sequence[Row[Any]]) -> list[dict[str, 
 
 
 def _estimates(rows: Sequence[Row[Any]], inputs: Sequence[Sequence[Any]]) -> list[dict[str, Any]]:
-    """One estimate for each row of sums: a :class:`service.schemas.SummaryEstimate` as plain data."""
+    """One estimate for each row of sums: a :class:`service.domain.views.SummaryEstimate` as plain data."""
     first = 1 + len(_KEY)
     sums = np.array([row[first:] for row in rows], dtype=float)
     counted, runs = sums[:, : len(COUNTED)].astype(np.int64).tolist(), sums[:, 0]
@@ -120,7 +121,7 @@ def _or_none(values: NDArray[np.float64], known: NDArray[np.bool_]) -> list[floa
 
 
 def _overall(row: Row[Any] | None) -> dict[str, Any] | None:
-    """One estimator over a grid: a :class:`service.schemas.OverallEstimate` as plain data."""
+    """One estimator over a grid: a :class:`service.domain.views.OverallEstimate` as plain data."""
     if row is None:
         return None
     column = row._mapping

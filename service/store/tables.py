@@ -28,7 +28,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.payload import COUNTS, LENS_PARAMETERS, QUANTITIES
+from service.domain.payload import COUNTS, LENS_PARAMETERS, QUANTITIES
 
 REVISION = "0008"
 """Revision of the migrations that these tables are."""
@@ -198,8 +198,6 @@ def _input_columns() -> list[Column[Any]]:
 
 GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
 """Runs that agree in these are runs of one input."""
-CONFIGURATIONS = {2: "double", 4: "quad"}
-"""What a lens with so many AGN images is called; any other is ``other``."""
 KEY_COLUMNS = (*GROUP_COLUMNS, "configuration", "regularisation", "profile", "engine_digest")
 """All that a row of ``input`` has in common: what answers are grouped and filtered by."""
 

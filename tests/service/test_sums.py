@@ -9,16 +9,16 @@ import pytest
 from rich.console import Console
 from sqlalchemy import Table, func, select, text
 
-from service.payload import ESTIMATES, estimator_and_prior
-from service.requests import GridRequest, plan
-from service.schemas import Summary
+from service.cli.formatting import summary_table
+from service.domain.payload import ESTIMATES, estimator_and_prior
+from service.domain.requests import GridRequest, plan
+from service.domain.views import Summary
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import MigrationError, downgrade, upgrade
 from service.store.queue import RunQueue
 from service.store.tables import GROUP_COLUMNS, SUMMED, estimate, grid_moments, input_group, input_moments, result
-from service.tables import summary_table
 from tests.service.plans import result_of, submit
 
 BODY = {"preset": "h0licow-vi/HE0435", "n": [2, 4], "l_eta": [1.0], "r_eff": [0.39], "replicates": 3}
@@ -148,7 +148,7 @@ def test_estimates_inputs_and_sums_go_through_the_wide_columns_and_back(database
     # The database numbers inputs anew; everything else is as it was, sums but for rounding.
     again = rows_of(database, input_group)
     assert sorted(row[1:-2] for row in again[0]) == sorted(row[1:-2] for row in inputs[0])
-    digests = [dict((row[0], row[2]) for row in found[0]) for found in (inputs, again)]
+    digests = [{row[0]: row[2] for row in found[0]} for found in (inputs, again)]
     for before, after in zip(exactly, rows_of(database, result, estimate), strict=True):
         place = (estimate if before is exactly[1] else result).c.keys().index("input_id")
         for old, new in zip(before, after, strict=True):

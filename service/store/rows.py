@@ -1,0 +1,188 @@
+"""Rows as the API's models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Row, RowMapping
+
+from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload, estimator_and_prior
+from service.domain.states import GridState, RunState
+from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunView
+from service.store.pace import Recent
+from service.store.tables import attempt, estimate, run
+
+RUN_COLUMNS = tuple(
+    run.c[name]
+    for name in (
+        "id", "grid_id", "ordinal", "label", "paper_run", "state", "inputs",
+        "attempt", "suspect", "error_code", "error_detail", "finished_at",
+    )
+)  # fmt: skip
+
+
+_ATTEMPT = tuple(AttemptView.model_fields)
+ATTEMPT_COLUMNS = tuple(attempt.c[name] for name in _ATTEMPT)
+# In the order in which _estimate takes them apart.
+ESTIMATE_COLUMNS = (
+    estimate.c.estimator,
+    estimate.c.index_prior,
+    *(estimate.c[f"{quantity}_{part}"] for quantity in QUANTITIES for part in ("mean", "sd", "bias")),
+    *(estimate.c[part] for part in COUNTS),
+)
+_ESTIMATES = {name: estimator_and_prior(name) for name in ESTIMATES}
+_LENS = {name: tuple(f"lens_{name.lower()}_{part}" for part in ("mean", "sd", "truth")) for name in LENS_PARAMETERS}
+_CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
+_GATHERED = ("estimates", "aperture", "regularisation", "profile", "lens", "chain")
+_PLAIN = tuple(name for name in ResultView.model_fields if name not in _GATHERED)
+
+
+def ended_grid_view(row: Row[Any]) -> GridView:
+    """A grid none of whose runs is open, from what was written down at its end."""
+    return _grid_view(row, RunCounts(**row.ending["counts"]), GridState(row.state), row.ending["rate_per_s"], 0.0)
+
+
+def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
+    """A grid with its progress; an unfinished one that is not paused is running once a run has been started."""
+    runs = RunCounts(**counts)
+    state = GridState(row.state)
+    if state is GridState.QUEUED and row.paused_at is not None:
+        state = GridState.PAUSED
+    elif state is GridState.QUEUED and (runs.leased or runs.ended):
+        state = GridState.RUNNING
+    remaining = runs.queued + runs.paused + runs.leased
+    rate, left = _pace(recent, remaining, now)
+    if state is GridState.PAUSED:
+        left = None
+    return _grid_view(row, runs, state, rate, left)
+
+
+def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | None, left: float | None) -> GridView:
+    return GridView(
+        id=row.id,
+        name=row.name,
+        state=state,
+        uws_phase=UWS_PHASES[state],
+        n_runs=row.n_runs,
+        counts=runs,
+        progress=runs.ended / row.n_runs,
+        rate_per_s=rate,
+        eta_seconds=left,
+        created_at=row.created_at,
+        finished_at=row.finished_at,
+        cancelled_at=row.cancelled_at,
+        paused_at=row.paused_at,
+        engine_digest=row.engine_digest,
+        request=row.request,
+        links={
+            "self": f"/v1/grids/{row.id}",
+            "runs": f"/v1/grids/{row.id}/runs",
+            "summary": f"/v1/grids/{row.id}/summary",
+            "events": f"/v1/grids/{row.id}/events",
+            **{action: f"/v1/grids/{row.id}/{action}" for action in ("cancel", "pause", "resume", "retry")},
+        },
+    )
+
+
+def _pace(recent: Recent | None, remaining: int, now: datetime) -> tuple[float | None, float | None]:
+    """Runs per second and seconds left.
+
+    Measured up to the last end and counted down from there, or the time left would grow while long runs are under
+    way; once it is used up the wait itself is part of the measure.
+    """
+    if recent is None:
+        return None, 0.0 if not remaining else None
+    rate = recent.rate()
+    left = remaining / rate - (now - recent.ended_at).total_seconds()
+    if remaining and left <= 0.0:
+        rate = recent.rate(now)
+        left = remaining / rate
+    return rate, max(left, 0.0) if remaining else 0.0
+
+
+def run_view(row: Row[Any]) -> RunView:
+    """A run as lists show it."""
+    return RunView(**_run_fields(row))
+
+
+def run_document(
+    row: Row[Any], found: Row[Any] | None, estimates: Sequence[Row[Any]], attempts: Sequence[Row[Any]]
+) -> dict[str, Any]:
+    """A run with all that belongs to it: a :class:`service.domain.views.RunDetail` as plain data, in its order.
+
+    A result has four hundred numbers; to check each of them again takes longer than to read them.
+    """
+    fields = _run_fields(row)
+    result = None if found is None else _result(found, estimates)
+    if result is not None and result["figure"] is not None:
+        fields["links"]["figure"] = f"/v1/runs/{row.id}/figure"
+    return {
+        **fields,
+        "spec": row.spec,
+        "digest": row.digest,
+        "result": result,
+        "attempts": [dict(zip(_ATTEMPT, ended, strict=True)) for ended in attempts],
+    }
+
+
+def _result(row: Row[Any], estimates: Sequence[Row[Any]]) -> dict[str, Any]:
+    """A result, its columns gathered by estimator and lens parameter: a :class:`service.domain.views.ResultView`."""
+    column = row._mapping
+    lens = {}
+    for name, (mean, sd, truth) in _LENS.items():
+        if column[mean] is not None:
+            lens[name] = {"mean": column[mean], "sd": column[sd], "truth": column[truth]}
+    answers = {(one.estimator, one.index_prior): _estimate(one) for one in estimates}
+    return {
+        "estimates": {name: answers.get(parts) for name, parts in _ESTIMATES.items()},
+        "aperture": _aperture(column),
+        "regularisation": row.regularisation,
+        "profile": row.profile,
+        "lens": lens,
+        "chain": None if row.chain_status is None else {name: column[place] for name, place in _CHAIN.items()},
+        **{name: column[name] for name in _PLAIN},
+    }
+
+
+def _estimate(row: Row[Any]) -> dict[str, Any]:
+    """A :class:`service.domain.views.EstimateView`; a quantity that is younger than the result is None."""
+    values: Iterator[Any] = iter(tuple(row)[2:])
+    found: dict[str, Any] = {}
+    for quantity in QUANTITIES:
+        mean, sd, bias = next(values), next(values), next(values)
+        found[quantity] = None if mean is None else {"mean": mean, "sd": sd, "bias": bias}
+    for part in COUNTS:
+        found[part] = next(values)
+    return found
+
+
+def _aperture(column: RowMapping) -> dict[str, Any] | None:
+    mean = column["aperture_magnitude_mean"]
+    if mean is None:
+        return None
+    return {
+        "radius": column["aperture_radius"],
+        "magnitude": {
+            "mean": mean,
+            "sd": column["aperture_magnitude_sd"],
+            "bias": column["aperture_magnitude_bias"],
+        },
+        "coverage": column["aperture_coverage"],
+        "draws": column["aperture_draws"],
+        "failed": column["aperture_failed"],
+    }
+
+
+def _run_fields(row: Row[Any]) -> dict[str, Any]:
+    state = RunState(row.state)
+    error = None if row.error_code is None else RunError(code=row.error_code, detail=row.error_detail)
+    plain = ("id", "grid_id", "ordinal", "label", "paper_run", "inputs", "attempt", "suspect", "finished_at")
+    return {
+        **{name: getattr(row, name) for name in plain},
+        "state": state,
+        "uws_phase": UWS_PHASES[state],
+        "error": error,
+        "links": {"self": f"/v1/runs/{row.id}", "grid": f"/v1/grids/{row.grid_id}"},
+    }
