@@ -72,10 +72,10 @@ def list_grids(
     return page.model_copy(update={"next": next_link(request, response, page.next)})
 
 
-@router.get("/grids/{grid_id}")
-def show_grid(grid_id: GridId, service: Service) -> GridView:
+@router.get("/grids/{grid_id}", response_model=GridView)
+def show_grid(grid_id: GridId, service: Service) -> Response:
     """One grid: its runs by state, rate and time left."""
-    return service.grids.grid(grid_id)
+    return _written(service.grids.grid(grid_id))
 
 
 @router.get("/grids/{grid_id}/runs")

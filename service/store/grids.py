@@ -17,7 +17,7 @@ from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunS
 from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
-from service.store.pace import recent
+from service.store.pace import progress, recent
 from service.store.pieces import Turns
 from service.store.rows import (
     ATTEMPT_COLUMNS,
@@ -263,7 +263,10 @@ class GridStore:
         row = connection.execute(_GRID, {"wanted": grid_id}).one_or_none()
         if row is None:
             raise NotFoundError(f"there is no grid {grid_id}")
-        return self._views(connection, [row])[0]
+        if row.ending is not None:
+            return ended_grid_view(row)
+        counts, latest = progress(connection, grid_id)
+        return grid_view(row, counts, latest, self._clock())
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()
