@@ -47,7 +47,7 @@ _PRIOR_FILLS: dict[IndexPrior, Literal["full", "left"]] = {"wide": "full", "free
 _SLOT = 0.8
 _PANEL_WIDTH, _PANEL_HEIGHT = 4.4, 2.75
 _MOST_LISTED = 24
-_LISTED_AN_INCH = 3.4
+_LISTED_AN_INCH, _BLOCK_HEIGHT = 2.4, 0.72
 
 
 class _Mean(NamedTuple):
@@ -106,9 +106,10 @@ def bias_figure(points: Iterable[BiasPoint], *, heading: str = "", columns: int 
     priors = prior_markers(point.index_prior for point in ordered)
     shapes = _slope_markers(sorted({point.l_eta for point in ordered}))
     rows, width = 4 // columns, _PANEL_WIDTH * columns
-    listed = len(numbers) <= min(_MOST_LISTED, _LISTED_AN_INCH * (width - 0.7))
+    blocks = -(-len(numbers) // int(_LISTED_AN_INCH * (width - 0.7))) if len(numbers) <= _MOST_LISTED else 0
     entries = _entries(ordered, magnitudes, priors)
-    below, legend_rows = 0.75 if listed else 0.25, -(-len(entries) // columns) + 1
+    legend_columns = 2 * columns - 1
+    below, legend_rows = max(_BLOCK_HEIGHT * blocks, 0.25), -(-len(entries) // legend_columns) + 1
     figure = new_figure(width, _PANEL_HEIGHT * rows + 0.7 + below + 0.2 * legend_rows)
     cells = figure.add_gridspec(rows + 1, columns, height_ratios=[*[_PANEL_HEIGHT] * rows, below])
     panels = [figure.add_subplot(cells[divmod(place, columns)]) for place in range(4)]
@@ -118,10 +119,10 @@ def bias_figure(points: Iterable[BiasPoint], *, heading: str = "", columns: int 
     _summary_panel(panels[3], ordered, magnitudes, shapes)
     figure.align_ylabels(panels)
     key = figure.add_subplot(cells[rows, :])
-    _list_numbers(key, numbers) if listed else _tell_numbers(key, numbers)
+    _list_numbers(key, numbers, blocks) if blocks else _tell_numbers(key, numbers)
     runs = len({point.run_id for point in ordered})
     title(figure, plain(heading), f"{plain(system)}: {estimator} estimator, {runs} run{'s' * (runs != 1)}")
-    legend(figure, entries, columns, side="left", name="(a) to (c)")
+    legend(figure, entries, legend_columns, side="left", name="(a) to (c)")
     legend(figure, _summary_entries(priors, shapes), columns, side="right", name="(d)")
     return figure
 
@@ -223,17 +224,21 @@ def _slope_markers(slopes: Sequence[float]) -> dict[float, str]:
     return {slope: shapes[rank % len(shapes)] for rank, slope in enumerate(slopes)}
 
 
-def _list_numbers(axes: Axes, numbers: dict[Setting, int]) -> None:
-    """The meaning of each serial number: the paper's Table 3, a column a number."""
+def _list_numbers(axes: Axes, numbers: dict[Setting, int], blocks: int) -> None:
+    """The meaning of each serial number: the paper's Table 3 on its side, in so many blocks below one another."""
+    names = ("No.", "$n$", r"$R_\mathrm{eff}$ [″]", r"$l_\eta$")
+    in_block, step = -(-len(numbers) // blocks), len(names) + 0.6
     axes.set_axis_off()
-    axes.set(xlim=(-0.9, len(numbers)), ylim=(4.0, 0.0))
-    for row, name in enumerate(("No.", "$n$", r"$R_\mathrm{eff}$ [″]", r"$l_\eta$")):
-        axes.text(-0.95, row + 0.5, name, fontsize=8.5, ha="left", va="center")
+    axes.set(xlim=(-0.16 * in_block, in_block), ylim=(step * blocks - 0.6, 0.0))
+    for block in range(blocks):
+        for row, name in enumerate(names):
+            axes.text(-0.16 * in_block, block * step + row + 0.5, name, fontsize=8.5, ha="left", va="center")
     for setting, number in numbers.items():
+        block, column = divmod(number - 1, in_block)
         cells = (f"{number}", f"{setting.n:g}", f"{setting.r_eff:g}", f"{setting.l_eta:g}")
         for row, cell in enumerate(cells):
             axes.text(
-                number - 0.3, row + 0.5, cell, fontsize=8.5, ha="center", va="center",
+                column + 0.5, block * step + row + 0.5, cell, fontsize=8.5, ha="center", va="center",
                 fontweight="bold" if row == 0 else "normal", gid=f"serial-{number}-{row}",
             )  # fmt: skip
 

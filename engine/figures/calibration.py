@@ -131,18 +131,19 @@ def _middles(axes: Axes, summaries: Sequence[PullSummary]) -> None:
         colour, marker, _ = _look(place)
         low, median, high = np.clip((group.low, group.median, group.high), -reach, reach)
         axes.plot(
-            [low, high],
-            [place, place],
-            color=colour,
-            linewidth=2.4,
-            solid_capstyle="butt",
-            path_effects=_EDGE,
+            [low, high], [place, place], color=colour, linewidth=2.4, solid_capstyle="butt", path_effects=_EDGE,
             gid=f"range-{place}",
-        )
+        )  # fmt: skip
         axes.plot(
             [median], [place], marker=marker, color=colour, markersize=7, markeredgecolor=INK, markeredgewidth=0.5,
-            gid=f"median-{place}",
+            clip_on=False, zorder=3, gid=f"median-{place}",
         )  # fmt: skip
+        if abs(group.median) > reach:
+            side, toward = ("right", -8) if group.median > 0.0 else ("left", 8)
+            axes.annotate(
+                f"median {group.median:.3g}".replace("inf", "∞"), (median, place), xytext=(toward, 9),
+                textcoords="offset points", ha=side, va="center", fontsize=8.5,
+            )  # fmt: skip
     axes.set(xlim=(-reach, reach), ylim=(len(summaries) - 0.5, -0.5))
     tidy(axes)
     axes.set_yticks(range(len(summaries)), [f"{plain(group.name)} ({group.count})" for group in summaries], fontsize=9)
