@@ -19,8 +19,8 @@ from scipy.special import ndtri
 from engine.conventions import FloatArray
 from engine.errors import FigureError, NothingToShowError
 from engine.result import EstimatorName, IndexPrior, Quantity, RunResult
-from engine.scene import resolve_system
-from engine.spec import Realization
+from engine.simulation.scene import resolve_system
+from engine.spec.realization import Realization
 
 HostQuantity = Literal["magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y"]
 Configuration = Literal["quad", "double", "other"]
@@ -125,7 +125,7 @@ def serial_numbers(points: Iterable[BiasPoint]) -> dict[Setting, int]:
     return {setting: number for number, setting in enumerate(sorted({point.setting for point in points}), 1)}
 
 
-def grouped(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[BiasPoint, ...]]:
+def group_points(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[BiasPoint, ...]]:
     """Points by the value that they share, smallest value first; a text of each value is its key.
 
     Raises
@@ -169,7 +169,7 @@ class Spread:
         return self.scatter / math.sqrt(self.count)
 
 
-def spread(points: Sequence[BiasPoint], quantity: HostQuantity) -> Spread:
+def mean_bias(points: Sequence[BiasPoint], quantity: HostQuantity) -> Spread:
     """Mean and scatter of the biases; a NothingToShowError without points."""
     bias, sd = _arrays(points, quantity)
     scatter = bias.std(ddof=1) if len(bias) > 1 else sd[0]
@@ -312,7 +312,7 @@ def _bin(index: int, width: float, members: list[tuple[float, BiasPoint]], quant
         lower=index * width,
         upper=(index + 1) * width,
         centre=float(np.mean(values)),
-        spread=spread(inside, quantity),
+        spread=mean_bias(inside, quantity),
         low=float(low),
         high=float(high),
     )

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from engine.biases import BiasPoint, HostQuantity, Setting, serial_numbers, spread
+from engine.biases import BiasPoint, HostQuantity, Setting, mean_bias, serial_numbers
 from engine.errors import FigureError
 from engine.figures.style import (
     AXIS_LABELS,
@@ -67,7 +67,7 @@ def _means(points: Sequence[BiasPoint], quantity: HostQuantity) -> list[_Mean]:
         groups.setdefault((point.index_prior, point.magnitude, point.setting), []).append(point)
     found = []
     for (prior, magnitude, setting), members in groups.items():
-        all_of_them = spread(members, quantity)
+        all_of_them = mean_bias(members, quantity)
         found.append(_Mean(magnitude, setting, prior, all_of_them.mean, all_of_them.scatter))
     return found
 
@@ -181,7 +181,7 @@ def _summary_panel(axes: Axes, points: Sequence[BiasPoint], magnitudes: list[flo
             for magnitude in magnitudes:
                 some = [p for p in points if (p.index_prior, p.l_eta, p.magnitude) == (prior, slope, magnitude)]
                 if some:
-                    found = spread(some, "magnitude")
+                    found = mean_bias(some, "magnitude")
                     groups.setdefault((prior, slope), []).append((magnitude, found.mean, found.scatter))
     everything = [item for series in groups.values() for item in series]
     limit_biases(axes, "magnitude", [item[1] for item in everything], [item[2] for item in everything])
