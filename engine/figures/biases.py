@@ -41,7 +41,7 @@ PRIOR_COLOURS: dict[IndexPrior, str] = {"wide": "#0072B2", "free": "#009E73", "f
 _PANELS: tuple[tuple[HostQuantity, str], ...] = (
     ("magnitude", "(a) magnitude"),
     ("r_eff", "(b) effective radius"),
-    ("n", "(c) Sérsic index, $n$ free"),
+    ("n", "(c) Sérsic index, n free"),
 )
 _PRIOR_FILLS: dict[IndexPrior, Literal["full", "left"]] = {"wide": "full", "free": "full", "fixed": "left"}
 _SLOT = 0.8
@@ -148,7 +148,7 @@ def _serial_panel(
     for number in range(2, len(numbers) + 1):
         axes.axvline(number - 0.5, color="0.75", linewidth=0.4, zorder=0.3)
     if not shown:
-        axes.text(0.5, 0.5, "no run with $n$ free", transform=axes.transAxes, ha="center", va="bottom", fontsize=9)
+        axes.text(0.5, 0.5, "no run with n free", transform=axes.transAxes, ha="center", va="bottom", fontsize=9)
         return
     means = _means(shown, quantity)
     limit_biases(axes, quantity, [m.bias for m in means], [m.error for m in means])
@@ -169,7 +169,7 @@ def _serial_panel(
 
 
 def _summary_panel(axes: Axes, points: Sequence[BiasPoint], magnitudes: list[float], shapes: dict[float, str]) -> None:
-    axes.set_title(r"(d) magnitude, mean over $n$ and $R_\mathrm{eff}$", fontsize=10, loc="left")
+    axes.set_title("(d) magnitude, mean over n and radius", fontsize=10, loc="left")
     axes.set_xlabel("magnitude of the host, true [AB mag]", fontsize=9)
     axes.set_ylabel(AXIS_LABELS["magnitude"], fontsize=9)
     tidy(axes)
@@ -226,13 +226,13 @@ def _slope_markers(slopes: Sequence[float]) -> dict[float, str]:
 
 def _list_numbers(axes: Axes, numbers: dict[Setting, int], blocks: int) -> None:
     """The meaning of each serial number: the paper's Table 3 on its side, in so many blocks below one another."""
-    names = ("No.", "$n$", r"$R_\mathrm{eff}$ [″]", r"$l_\eta$")
+    names = ("No.", "n", "radius [″]", r"$l_\eta$")
     in_block, step = -(-len(numbers) // blocks), len(names) + 0.6
     axes.set_axis_off()
-    axes.set(xlim=(-0.16 * in_block, in_block), ylim=(step * blocks - 0.6, 0.0))
+    axes.set(xlim=(-0.2 * in_block, in_block), ylim=(step * blocks - 0.6, 0.0))
     for block in range(blocks):
         for row, name in enumerate(names):
-            axes.text(-0.16 * in_block, block * step + row + 0.5, name, fontsize=8.5, ha="left", va="center")
+            axes.text(-0.2 * in_block, block * step + row + 0.5, name, fontsize=8.5, ha="left", va="center")
     for setting, number in numbers.items():
         block, column = divmod(number - 1, in_block)
         cells = (f"{number}", f"{setting.n:g}", f"{setting.r_eff:g}", f"{setting.l_eta:g}")
@@ -246,6 +246,6 @@ def _list_numbers(axes: Axes, numbers: dict[Setting, int], blocks: int) -> None:
 def _tell_numbers(axes: Axes, numbers: dict[Setting, int]) -> None:
     axes.set_axis_off()
     axes.text(
-        0.5, 0.5, f"1–{len(numbers)}: by $l_\\eta$, within it by $R_\\mathrm{{eff}}$, within that by $n$",  # noqa: RUF001
+        0.5, 0.5, f"1–{len(numbers)}: by $l_\\eta$, within it by radius, within that by n",  # noqa: RUF001
         fontsize=8.5, ha="center", va="center", transform=axes.transAxes,
     )  # fmt: skip

@@ -16,6 +16,7 @@ from engine.figures.style import (
     INK,
     LINES,
     MARKERS,
+    MINUS,
     NAMES,
     OKABE_ITO,
     Look,
@@ -63,7 +64,7 @@ def coverage_figure(curves: Sequence[CoverageCurve], quantity: HostQuantity, *, 
         entries.append(mark(f"{plain(curve.name)}, {_runs(curve.count)}", Look(marker, colour, 7.0, ""), line=line))
     axes.set(xlim=(0.0, 1.03), ylim=(-0.02, 1.03), aspect="equal")
     axes.axvline(ONE_SIGMA, color="0.75", linewidth=0.6, zorder=0.3)
-    axes.text(ONE_SIGMA - 0.01, 0.99, r"1 $\sigma$", fontsize=8.5, color="0.35", ha="right", va="top")
+    axes.text(ONE_SIGMA - 0.01, 0.99, "1 σ", fontsize=8.5, color="0.35", ha="right", va="top")
     axes.text(0.03, 0.97, "stated errors too large", fontsize=8.5, color="0.35", va="top")
     axes.text(0.99, 0.08, "too small", fontsize=8.5, color="0.35", ha="right")
     axes.set_xlabel("probability that the interval claims", fontsize=9)
@@ -97,7 +98,7 @@ def pull_figure(
     left, right = figure.subplots(rows, columns).flat
     _histogram(left, summaries)
     _middles(right, summaries)
-    title(figure, plain(heading), f"Pulls of the {NAMES[quantity]}: (found $-$ true) / stated deviation")
+    title(figure, plain(heading), f"Pulls of the {NAMES[quantity]}: (found {MINUS} true) / stated deviation")
     return figure
 
 

@@ -28,15 +28,17 @@ LINES = ("-", "--", "-.", ":")
 INK = "0.15"
 TARGET_BANDS = ((0.5, "0.84"), (1.25, "0.93"))
 """Half-widths [mag] and greys: what is wanted, and the scatter of black-hole masses (0.5 dex), as in the paper."""
+MINUS = "\N{MINUS SIGN}"
+# Plain words wherever they do: mathematics is drawn letter by letter, and nobody finds it or reads it aloud.
 AXIS_LABELS: dict[HostQuantity, str] = {
-    "magnitude": "magnitude, found $-$ true [mag]",
-    "r_eff": r"$R_\mathrm{eff}$, found $-$ true [arcsec]",
-    "r_eff_galfit": r"$R_\mathrm{eff}$ on the major axis, found $-$ true [arcsec]",
-    "n": "$n$, found $-$ true",
-    "q": "axis ratio, found $-$ true",
-    "position_angle": "position angle, found $-$ true [deg]",
-    "x": "$x$, found $-$ true [arcsec]",
-    "y": "$y$, found $-$ true [arcsec]",
+    "magnitude": f"magnitude, found {MINUS} true [mag]",
+    "r_eff": f"effective radius, found {MINUS} true [arcsec]",
+    "r_eff_galfit": f"radius on the major axis, found {MINUS} true [arcsec]",
+    "n": f"n, found {MINUS} true",
+    "q": f"axis ratio, found {MINUS} true",
+    "position_angle": f"position angle, found {MINUS} true [deg]",
+    "x": f"x, found {MINUS} true [arcsec]",
+    "y": f"y, found {MINUS} true [arcsec]",
 }
 NAMES: dict[HostQuantity, str] = {
     "magnitude": "magnitude",
@@ -50,8 +52,8 @@ NAMES: dict[HostQuantity, str] = {
 }
 TREND_LABELS: dict[Trend, str] = {
     "arc_magnitude": "host arc in the image plane [AB mag]",
-    "agn_contrast": "AGN $-$ host arc [mag]",
-    "surface_brightness": r"host within $R_\mathrm{eff}$ [mag arcsec$^{-2}$]",
+    "agn_contrast": f"AGN {MINUS} host arc [mag]",
+    "surface_brightness": "host surface brightness [mag arcsec⁻²]",
 }
 _MOST_VECTORS = 2_000
 _CHARACTERS_AN_INCH = 11.0
@@ -102,9 +104,9 @@ def bar(label: str) -> Line2D:
 def prior_label(prior: IndexPrior) -> str:
     """What was assumed about the Sersic index."""
     if prior == "fixed":
-        return "$n$ fixed to the truth"
+        return "n fixed to the truth"
     low, high = INDEX_RANGES[prior]
-    return f"$n$ free in {low:g}–{high:g}"  # noqa: RUF001 - a range
+    return f"n free in {low:g}–{high:g}"  # noqa: RUF001 - a range
 
 
 def prior_markers(priors: Iterable[IndexPrior]) -> dict[IndexPrior, str]:
