@@ -8,12 +8,15 @@ from engine.figures.output import FIGURE_FORMATS, FigureFormat, figure_bytes
 from engine.figures.run import run_figure
 from engine.figures.sample import sample_figure
 from engine.figures.simulation import gallery_figure, montage_figure, simulation_figure
+from engine.figures.style import LIMITS, Limits
 from engine.figures.thumbnails import Pictures, Thumbnail, grid_figure, pictures_of
 from engine.figures.trends import trend_figure
 
 __all__ = [
     "FIGURE_FORMATS",
+    "LIMITS",
     "FigureFormat",
+    "Limits",
     "Pictures",
     "Thumbnail",
     "bias_figure",

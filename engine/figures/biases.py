@@ -16,6 +16,7 @@ from engine.biases import BiasPoint, HostQuantity, Setting, mean_bias, serial_nu
 from engine.errors import FigureError
 from engine.figures.style import (
     AXIS_LABELS,
+    Limits,
     Look,
     band_patches,
     bar,
@@ -72,7 +73,9 @@ def _means(points: Sequence[BiasPoint], quantity: HostQuantity) -> list[_Mean]:
     return found
 
 
-def bias_figure(points: Iterable[BiasPoint], *, heading: str = "", columns: int = 2) -> Figure:
+def bias_figure(
+    points: Iterable[BiasPoint], *, heading: str = "", columns: int = 2, limits: Limits = "bands"
+) -> Figure:
     """Biases of one system: four panels with the meaning of the paper's Figs. 5-12.
 
     (a), (b), (c): bias of magnitude, R_eff and n against the serial number; colours are the hosts' magnitudes,
@@ -89,6 +92,8 @@ def bias_figure(points: Iterable[BiasPoint], *, heading: str = "", columns: int 
         What stands above, as the name of the grid.
     columns : int
         Panels beside one another: 2, or 1 for a phone.
+    limits : "bands" or "data"
+        Panels of the magnitude show the whole of both bands, or as near as the points are.
 
     Raises
     ------
@@ -115,8 +120,8 @@ def bias_figure(points: Iterable[BiasPoint], *, heading: str = "", columns: int 
     panels = [figure.add_subplot(cells[divmod(place, columns)]) for place in range(4)]
     for axes, (quantity, name) in zip(panels, _PANELS, strict=False):
         axes.set_title(name, fontsize=10, loc="left")
-        _serial_panel(axes, ordered, quantity, numbers, magnitudes, priors)
-    _summary_panel(panels[3], ordered, magnitudes, shapes)
+        _serial_panel(axes, ordered, quantity, numbers, magnitudes, priors, limits)
+    _summary_panel(panels[3], ordered, magnitudes, shapes, limits)
     figure.align_ylabels(panels)
     key = figure.add_subplot(cells[rows, :])
     _list_numbers(key, numbers, blocks) if blocks else _tell_numbers(key, numbers)
@@ -134,6 +139,7 @@ def _serial_panel(
     numbers: dict[Setting, int],
     magnitudes: list[float],
     priors: dict[IndexPrior, str],
+    limits: Limits,
 ) -> None:
     # An index that is fixed to the truth has no bias to show.
     shown = [p for p in points if quantity != "n" or p.index_prior != "fixed"]
@@ -151,7 +157,7 @@ def _serial_panel(
         axes.text(0.5, 0.5, "no run with n free", transform=axes.transAxes, ha="center", va="bottom", fontsize=9)
         return
     means = _means(shown, quantity)
-    limit_biases(axes, quantity, [m.bias for m in means], [m.error for m in means])
+    limit_biases(axes, quantity, [m.bias for m in means], [m.error for m in means], limits)
     step = _SLOT / len(magnitudes)
     for rank, (magnitude, colour) in enumerate(zip(magnitudes, shades(len(magnitudes)), strict=True)):
         for place, (prior, marker) in enumerate(priors.items()):
@@ -168,7 +174,9 @@ def _serial_panel(
             )
 
 
-def _summary_panel(axes: Axes, points: Sequence[BiasPoint], magnitudes: list[float], shapes: dict[float, str]) -> None:
+def _summary_panel(
+    axes: Axes, points: Sequence[BiasPoint], magnitudes: list[float], shapes: dict[float, str], limits: Limits
+) -> None:
     axes.set_title("(d) magnitude, mean over n and radius", fontsize=10, loc="left")
     axes.set_xlabel("magnitude of the host, true [AB mag]", fontsize=9)
     axes.set_ylabel(AXIS_LABELS["magnitude"], fontsize=9)
@@ -184,7 +192,7 @@ def _summary_panel(axes: Axes, points: Sequence[BiasPoint], magnitudes: list[flo
                     found = mean_bias(some, "magnitude")
                     groups.setdefault((prior, slope), []).append((magnitude, found.mean, found.scatter))
     everything = [item for series in groups.values() for item in series]
-    limit_biases(axes, "magnitude", [item[1] for item in everything], [item[2] for item in everything])
+    limit_biases(axes, "magnitude", [item[1] for item in everything], [item[2] for item in everything], limits)
     gap = min(np.diff(magnitudes), default=0.5)
     axes.set_xlim(magnitudes[0] - 0.6 * gap, magnitudes[-1] + 0.6 * gap)
     if len(magnitudes) <= 8:

@@ -17,6 +17,7 @@ from engine.figures.style import (
     AXIS_LABELS,
     OKABE_ITO,
     TREND_LABELS,
+    Limits,
     Look,
     band_patches,
     bar,
@@ -43,7 +44,12 @@ _LETTERS = "abcdef"
 
 
 def sample_figure(
-    points: Iterable[BiasPoint], *, free: IndexPrior = "wide", heading: str = "", columns: int = 2
+    points: Iterable[BiasPoint],
+    *,
+    free: IndexPrior = "wide",
+    heading: str = "",
+    columns: int = 2,
+    limits: Limits = "bands",
 ) -> Figure:
     """Bias of the magnitude across the sample: six panels with the meaning of the paper's Fig. 13.
 
@@ -62,6 +68,8 @@ def sample_figure(
         What stands above, as the name of the grid.
     columns : int
         Panels beside one another: 2, or 1 for a phone.
+    limits : "bands" or "data"
+        Panels of the magnitude show the whole of both bands, or as near as the points are.
 
     Raises
     ------
@@ -93,7 +101,7 @@ def sample_figure(
             tidy(panel)
             zero_line(panel)
             target_bands(panel)
-            _panel(panel, placed, [p for p in placed if p.index_prior == prior], against, looks)
+            _panel(panel, placed, [p for p in placed if p.index_prior == prior], against, looks, limits)
     runs = len({point.run_id for point in ordered})
     title(figure, plain(heading), f"{len(looks)} systems, {runs} runs: {estimator} estimator")
     legend(figure, entries, 2 * columns)
@@ -119,6 +127,7 @@ def _panel(
     points: Sequence[BiasPoint],
     against: Trend,
     looks: dict[str, Look],
+    limits: Limits,
 ) -> None:
     """One panel; ``placed`` are the points of the whole row, which share their limits."""
     if not placed:
@@ -128,7 +137,7 @@ def _panel(
     room = 0.05 * (max(values) - min(values)) or 0.5
     axes.set_xlim(min(values) - room, max(values) + room)
     biases = [point.bias("magnitude") for point in placed]
-    limit_biases(axes, "magnitude", biases, [point.sd("magnitude") for point in placed])
+    limit_biases(axes, "magnitude", biases, [point.sd("magnitude") for point in placed], limits)
     for name, look in looks.items():
         some = [point for point in points if point.system == name]
         if some:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import matplotlib as mpl
 import numpy as np
@@ -28,6 +28,9 @@ LINES = ("-", "--", "-.", ":")
 INK = "0.15"
 TARGET_BANDS = ((0.5, "0.84"), (1.25, "0.93"))
 """Half-widths [mag] and greys: what is wanted, and the scatter of black-hole masses (0.5 dex), as in the paper."""
+Limits = Literal["bands", "data"]
+LIMITS: tuple[Limits, ...] = get_args(Limits)
+"""How far magnitudes are shown: the whole of both bands at least, or as near as the points are."""
 MINUS = "\N{MINUS SIGN}"
 # Plain words wherever they do: mathematics is drawn letter by letter, and nobody finds it or reads it aloud.
 AXIS_LABELS: dict[HostQuantity, str] = {
@@ -74,7 +77,11 @@ def plain(text: str) -> str:
 def title(figure: Figure, *lines: str) -> None:
     """A title that is broken where the figure ends, its first line larger than the page's text."""
     room = int(_CHARACTERS_AN_INCH * figure.get_figwidth())
-    broken = [part for line in lines if line for part in textwrap.wrap(line, room)]
+    broken = []
+    for line in lines:
+        # Parts of like length, rather than a last word alone.
+        parts = max(1, -(-len(line) // room))
+        broken += textwrap.wrap(line, room if parts == 1 else min(room, len(line) // parts + 6))
     figure.suptitle("\n".join(broken), fontsize=10.5)
 
 
@@ -150,13 +157,22 @@ class Look:
     fill: Literal["full", "left", "right", "bottom", "top"] = "full"
 
 
-def limit_biases(axes: Axes, quantity: HostQuantity, biases: Sequence[float], errors: Sequence[float]) -> None:
+def limit_biases(
+    axes: Axes, quantity: HostQuantity, biases: Sequence[float], errors: Sequence[float], limits: Limits
+) -> None:
     """Set limits round zero that show all but far outliers, and say how many are beyond them.
 
     Far is four times further than nine tenths of all; :func:`draw_points` puts those at the edge.
+
+    Raises
+    ------
+    FigureError
+        There are no such limits.
     """
+    if limits not in LIMITS:
+        raise FigureError(f"limits: got {limits!r}, allowed is one of {list(LIMITS)}")
     values, bars = np.asarray(biases, dtype=float), np.asarray(errors, dtype=float)
-    least = _LEAST_REACH.get(quantity, 0.0)
+    least = _LEAST_REACH.get(quantity, 0.0) if limits == "bands" else 0.0
     usual = max(_FAR * float(np.quantile(np.abs(values), 0.9)), least)
     reach = [float((bars - values).max()), float((bars + values).max())]
     ends = [end if end <= 1.5 * usual else usual for end in (max(end, 0.0) for end in reach)]

@@ -18,6 +18,7 @@ from engine.figures.style import (
     NAMES,
     OKABE_ITO,
     TREND_LABELS,
+    Limits,
     Look,
     band_patches,
     bar,
@@ -36,7 +37,9 @@ from engine.figures.style import (
 _PANEL_WIDTH, _PANEL_HEIGHT = 4.4, 2.9
 
 
-def trend_figure(series: Sequence[TrendSeries], *, heading: str = "", columns: int | None = None) -> Figure:
+def trend_figure(
+    series: Sequence[TrendSeries], *, heading: str = "", columns: int | None = None, limits: Limits = "bands"
+) -> Figure:
     """Mean bias in bins: a panel for each abscissa, a line for each name.
 
     Bars are the error of the mean (of one run its stated deviation), shaded is where 68 % of the runs lie, numbers at
@@ -50,6 +53,8 @@ def trend_figure(series: Sequence[TrendSeries], *, heading: str = "", columns: i
         What stands above, as the name of the grid.
     columns : int, optional
         Panels beside one another; all of them where not given, 1 for a phone.
+    limits : "bands" or "data"
+        Panels of the magnitude show the whole of both bands, or as near as the points are.
 
     Raises
     ------
@@ -78,7 +83,7 @@ def trend_figure(series: Sequence[TrendSeries], *, heading: str = "", columns: i
     for panel in panels.flat[len(axes_of) :]:
         panel.set_axis_off()
     for panel, against in zip(panels.flat, axes_of, strict=False):
-        _panel(panel, [one for one in shown if one.against == against], names)
+        _panel(panel, [one for one in shown if one.against == against], names, limits)
         panel.set_xlabel(TREND_LABELS[against], fontsize=9)
         panel.set_ylabel(AXIS_LABELS[quantity], fontsize=9)
     title(figure, plain(heading), f"Mean bias of the {NAMES[quantity]} in bins")
@@ -91,14 +96,16 @@ def trend_figure(series: Sequence[TrendSeries], *, heading: str = "", columns: i
     return figure
 
 
-def _panel(axes: Axes, series: Sequence[TrendSeries], names: list[str]) -> None:
+def _panel(axes: Axes, series: Sequence[TrendSeries], names: list[str], limits: Limits) -> None:
     tidy(axes)
     zero_line(axes)
     quantity = series[0].quantity
     if quantity == "magnitude":
         target_bands(axes)
     everything = [one_bin for one in series for one_bin in one.bins]
-    limit_biases(axes, quantity, [b.spread.mean for b in everything], [b.spread.error for b in everything])
+    limit_biases(axes, quantity, [b.spread.mean for b in everything], [b.spread.error for b in everything], limits)
+    room = 0.5 * (everything[0].upper - everything[0].lower)
+    axes.set_xlim(min(b.lower for b in everything) - room, max(b.upper for b in everything) + room)
     for one in series:
         place = names.index(one.name)
         colour = OKABE_ITO[place]

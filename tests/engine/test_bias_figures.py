@@ -349,6 +349,24 @@ def test_far_outliers_stand_at_the_edge_and_are_counted():
     assert "2 beyond, at the edge" in texts(figure)
 
 
+def test_small_biases_are_seen_with_limits_of_the_data_and_bands_with_those_of_the_bands():
+    small = [replace(p, recovered={k: Quantity(v.truth + 0.02, 0.01, v.truth) for k, v in p.recovered.items()})
+             for p in paper_grid(("wide", "fixed"))]  # fmt: skip
+    series = [trend_series("x", small, "magnitude", "arc_magnitude")]
+    for draw in (
+        lambda limits: bias_figure(small, limits=limits).axes[0],
+        lambda limits: bias_figure(small, limits=limits).axes[3],
+        lambda limits: sample_figure(small, limits=limits).axes[1],
+        lambda limits: trend_figure(series, limits=limits).axes[0],
+    ):
+        low, high = draw("data").get_ylim()
+        assert 0.02 < high < 0.05
+        assert -0.05 < low < 0.0
+        low, high = draw("bands").get_ylim()
+        assert low < -1.25
+        assert high > 1.25
+
+
 def test_nothing_to_show_is_an_error_that_says_so():
     for draw in (
         bias_figure, sample_figure, trend_figure, grid_figure,
@@ -367,6 +385,7 @@ def test_what_does_not_belong_together_is_refused_by_name():
         (lambda: bias_figure(two), "system: got HE0435, HE1104"),
         (lambda: bias_figure([point(), point(estimator="image")]), "estimator: got image, paper"),
         (lambda: bias_figure([point()], columns=3), "columns: got 3, allowed is 1 or 2"),
+        (lambda: bias_figure([point()], limits="all"), "limits: got 'all', allowed is one of"),
         (lambda: sample_figure([point()], free="fixed"), "free: got 'fixed'"),
         (lambda: sample_figure([point(), point(estimator="image")], free="free"), "estimator: got"),
         (lambda: figure_bytes(bias_figure([point()]), "pdf"), "format: got 'pdf'"),
