@@ -45,7 +45,7 @@ def progress(service: Installation, grid_id: str, least: int) -> int:
         done = service.client.status(grid_id).counts.done
         return done if done >= least else 0
 
-    return eventually(look, 120, f"the result number {least}")
+    return eventually(look, what=f"the result number {least}")
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class DispatcherKills(Drill):
 
     @staticmethod
     def _kill(service: Installation) -> float:
-        found = eventually(lambda: service.child("service.dispatcher"), 60, "a dispatcher")
+        found = eventually(lambda: service.child("service.dispatcher"), what="a dispatcher")
         if found is not None:
             found.kill()
         return time.monotonic()

@@ -136,7 +136,7 @@ class SqliteLock(Drill):
                     reads.append(time.monotonic() - began)
                     time.sleep(0.05)
             finally:
-                locker.wait(timeout=60)
+                locker.wait(timeout=120)
                 if locker.stdout is not None:
                     locker.stdout.close()
             other.join(60)
@@ -195,7 +195,7 @@ class DiskFull(Drill):
                 time.sleep(max(until - time.monotonic(), 0.0))
                 stuck = service.client.status(grid.id).counts.done
             freed = time.monotonic()
-            eventually(lambda: _answers(lambda: service.client.submit(body(1, seed=10_000))), 30, "an accepted grid")
+            eventually(lambda: _answers(lambda: service.client.submit(body(1, seed=10_000))), what="an accepted grid")
             accepted = time.monotonic() - freed
             progress(service, grid.id, min(stuck + 1, self.runs))
             resumed = time.monotonic() - freed
@@ -206,7 +206,7 @@ class DiskFull(Drill):
             read_only = f"sqlite:///file:{file}?mode=ro&uri=true"
             service.start("service.api", HOSTLENS_PORT=str(port), HOSTLENS_DATABASE_URL=read_only)
             with Client(f"http://127.0.0.1:{port}") as client:
-                eventually(lambda: _answers(lambda: client.status(grid.id)), 30, "an answer from the read-only API")
+                eventually(lambda: _answers(lambda: client.status(grid.id)), what="an answer from the read-only API")
                 refused_too = _refusal(client)
             intact = _integrity(service)
         return Report(

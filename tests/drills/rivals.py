@@ -102,7 +102,7 @@ class TwoDispatchers(Drill):
             before = Counter(service.executed())
             psutil.Process(int(first.holder.split("|")[1])).send_signal(signal.SIGKILL)
             killed = time.monotonic()
-            eventually(lambda: _leader(service).generation > first.generation, 60, "a new leader")
+            eventually(lambda: _leader(service).generation > first.generation, what="a new leader")
             leads = time.monotonic() - killed
             done = service.client.status(grid.id).counts.done
             progress(service, grid.id, done + 1)
@@ -131,7 +131,7 @@ class TwoDispatchers(Drill):
 
 def _leader(service: Installation) -> LeaderView:
     with closing(Database(service.database, pooled=False)) as database:
-        return eventually(Leadership(database).view, 30, "a leader") or _never()
+        return eventually(Leadership(database).view, what="a leader") or _never()
 
 
 def _never() -> LeaderView:

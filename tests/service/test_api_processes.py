@@ -51,7 +51,7 @@ def test_each_process_tells_the_metrics_of_all_and_a_killed_one_is_started_again
         ask(service, 20)
         assert counted(service) == before + 60
         assert service.end() == 0
-        assert service.processes() == []
+        eventually(lambda: service.processes() == [], what="the end of all processes")
         assert not list((tmp_path / "data").glob("metrics-*"))
 
 

@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 from service.api.app import create_app
 from service.cli.app import app
 from service.runtime.settings import Settings
-from tests.service.service_process import ROOT, free_port, serving
+from tests.service.service_process import ROOT, eventually, free_port, serving
 
 NOBODY = "http://127.0.0.1:1"
 GRID = "g_06h05zns0sxqesvz1qxk4a1s56"
@@ -364,9 +364,9 @@ def test_a_service_whose_output_nobody_reads_or_that_has_none_goes_on(tmp_path: 
             for _ in range(1200):
                 service.client.grids(limit=1)
             grid = service.client.submit({"preset": "h0licow-vi/HE0435", "n": [2]})
-            assert service.client.wait(grid.id, timeout_s=120).counts.done == grid.n_runs
+            assert service.client.wait(grid.id, timeout_s=300).counts.done == grid.n_runs
             assert service.end() == 0
-            assert service.processes() == []
+            eventually(lambda: service.processes() == [], what="the end of all processes")
     file = tmp_path / "closed" / "data" / "hostlens.sqlite"
     assert file.read_bytes().startswith(b"SQLite format 3")
 

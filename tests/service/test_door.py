@@ -79,7 +79,7 @@ def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         )
     try:
         found = Server(port, log)
-        eventually(lambda: answers(found), 120, "an answer of the server")
+        eventually(lambda: answers(found), what="an answer of the server")
         yield found
         assert "Traceback" not in log.read_text()
     finally:

@@ -35,7 +35,7 @@ def test_nothing_that_a_worker_answers_becomes_code_in_the_dispatcher(tmp_path: 
     }
     with serving(tmp_path, **settings) as service:
         grid = service.client.submit(body(len(MODES)))
-        ended = service.client.wait(grid.id, timeout_s=120)
+        ended = service.client.wait(grid.id, timeout_s=300)
         runs = {
             mode: service.client.run(found.id) for mode, found in zip(MODES, service.client.runs(grid.id), strict=True)
         }
@@ -52,7 +52,7 @@ def test_nothing_that_a_worker_answers_becomes_code_in_the_dispatcher(tmp_path: 
         assert not (harm / str(dispatcher.pid)).exists(), harmed(harm, service)
         # It goes on, with the same dispatcher.
         again = service.client.submit(body(2, seed=0))
-        eventually(lambda: service.client.status(again.id).finished_at is not None, 60, "the end of another grid")
+        eventually(lambda: service.client.status(again.id).finished_at is not None, what="the end of another grid")
         assert service.child("service.dispatcher") == dispatcher
 
 

@@ -296,7 +296,7 @@ def test_a_password_that_is_changed_under_a_running_service_is_told_as_that_unti
         connection.exec_driver_sql("SELECT pg_reload_conf()")
     url = migrated_postgres.replace("hostlens@", f"locked_in:{OURS}@")
     with TestClient(create_app(Settings(database_url=url, data_dir=tmp_path)), raise_server_exceptions=False) as api:
-        eventually(lambda: api.get("/readyz").status_code == 200, 10, "the reloaded rules")
+        eventually(lambda: api.get("/readyz").status_code == 200, what="the reloaded rules")
         for password, status in (("another", 503), (OURS, 200)):
             with admin.write() as connection:
                 connection.exec_driver_sql(f"ALTER ROLE locked_in PASSWORD '{password}'")

@@ -230,17 +230,17 @@ def test_a_file_that_was_read_only_for_a_while_is_written_again_once_it_may_be(f
 def test_a_running_service_goes_on_once_its_file_is_back(tmp_path: Path) -> None:
     with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.2") as service:
         made = service.client.submit(body(20))
-        eventually(lambda: service.client.status(made.id).counts.done > 2, 60, "progress")
+        eventually(lambda: service.client.status(made.id).counts.done > 2, what="progress")
         leader = service.child("service.dispatcher")
         file = tmp_path / "data" / "hostlens.sqlite"
         hidden = tmp_path / "hidden.sqlite"
         file.rename(hidden)
-        eventually(lambda: service.readiness() is None, 10, "503")
-        eventually(lambda: "there is no database file" in service.tail(), 10, "a line in the log")
-        eventually(lambda: "the database is away" in service.tail(), 15, "a line of the dispatcher in the log")
+        eventually(lambda: service.readiness() is None, what="503")
+        eventually(lambda: "there is no database file" in service.tail(), what="a line in the log")
+        eventually(lambda: "the database is away" in service.tail(), what="a line of the dispatcher in the log")
         assert not file.exists()
         hidden.rename(file)
-        ended = service.client.wait(made.id, timeout_s=90)
+        ended = service.client.wait(made.id, timeout_s=300)
         assert ended.counts.done == 20
         now = service.child("service.dispatcher")
         assert leader is not None
