@@ -37,7 +37,7 @@ class StoppedWorker(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Stop a worker that is at a run; wake it when the grid has ended, if it is still there."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_DEADLINE_S": str(self.deadline_s)}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
             service.wait_ready(2)
@@ -89,7 +89,7 @@ class TwoDispatchers(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Start both without a supervisor, so that nobody brings the dead one back."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         folder = ground.folder / "drill"
         (folder / "data").mkdir(parents=True)
         upgrade(ground.database_url or f"sqlite:///{folder / 'data' / 'hostlens.sqlite'}")
