@@ -104,6 +104,11 @@ def _interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _require_changes(sizes: list[str]) -> None:
+    if any("=" not in changed for changed in sizes):
+        raise DrillError(f"sizes are given as name=value: {' '.join(sizes)}")
+
+
 @app.command()
 def drill(
     name: Annotated[str, typer.Argument(help="One of those that ``list`` shows")],
@@ -121,8 +126,7 @@ def drill(
     logging.getLogger("alembic").setLevel(logging.WARNING)
     sizes = size or []
     try:
-        if any("=" not in changed for changed in sizes):
-            raise DrillError(f"sizes are given as name=value: {' '.join(sizes)}")
+        _require_changes(sizes)
         if json_file is not None:
             require_file(json_file)
         if database_url is not None and database_url != "postgresql":

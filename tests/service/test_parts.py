@@ -30,7 +30,7 @@ from engine.result import (
     RunResult,
     StageTime,
 )
-from engine.spec import Analysis
+from engine.spec.analysis import Analysis
 from service.api.app import create_app
 from service.cli.app import app
 from service.dispatcher.identity import is_dead, own_name
