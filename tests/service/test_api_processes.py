@@ -53,10 +53,3 @@ def test_each_process_tells_the_metrics_of_all_and_a_killed_one_is_started_again
         assert service.end() == 0
         eventually(lambda: service.processes() == [], what="the end of all processes")
         assert not list((tmp_path / "data").glob("metrics-*"))
-
-
-def test_a_single_process_tells_of_itself(tmp_path: Path) -> None:
-    with serving(tmp_path, HOSTLENS_API_PROCESSES="1") as service:
-        assert len(apis(service)) == 1
-        shown = httpx.get(f"http://127.0.0.1:{service.port}/metrics", timeout=20.0).text
-        assert "process_resident_memory_bytes" in shown

@@ -110,4 +110,10 @@ def test_every_process_tells_of_a_run_with_its_grid_attempt_and_generation(told:
     }
     assert told.found(process="api", event="accepted", grid=grid)
     assert told.found(process="api", logger="uvicorn.access", grid=grid, method="GET", status=200)
-    assert {line["process"] for line in told.lines} == {"supervisor", "api", "dispatcher", "worker"}
+    assert {line["process"] for line in told.lines} == {
+        "supervisor",
+        "api",
+        "dispatcher",
+        "cluster",
+        "worker",
+    }

@@ -6,10 +6,11 @@ import shutil
 import sqlite3
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -42,7 +43,7 @@ def locked(file: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("writers", [20, 60])
 def test_reads_do_not_wait_for_writers_who_wait_for_the_lock(sqlite_url: str, tmp_path: Path, writers: int) -> None:
-    """The median below 100 ms, against seconds where they share a pool; whatever else runs on the machine."""
+    """Half of them within a second, against the thirty that SQLite waits for a lock where they share a pool."""
     file = Path(sqlite_url.removeprefix("sqlite:///"))
     settings = Settings(database_url=sqlite_url, data_dir=tmp_path)
     took = []
@@ -51,8 +52,8 @@ def test_reads_do_not_wait_for_writers_who_wait_for_the_lock(sqlite_url: str, tm
         with ThreadPoolExecutor(writers) as threads:
             with locked(file):
                 answers = [threads.submit(api.post, "/v1/grids", json=body(1, seed=n)) for n in range(writers)]
-                # Until they wait; beyond what may wait they are refused after a second without progress.
-                time.sleep(2.5)
+                # Beyond what may wait they are refused after a second without progress.
+                eventually(lambda: waiting(api) + ended(answers) >= writers, what="writers that wait")
                 for _ in range(30):
                     began = time.monotonic()
                     assert api.get("/v1/grids").status_code == 200
@@ -65,7 +66,17 @@ def test_reads_do_not_wait_for_writers_who_wait_for_the_lock(sqlite_url: str, tm
         assert statuses.count(202) >= min(writers, 20)
         assert len(api.get("/v1/grids").json()["items"]) == statuses.count(202)
     print(f"median {1e3 * statistics.median(took):.0f} ms, slowest {1e3 * max(took):.0f} ms")
-    assert statistics.median(took) < 0.1
+    assert statistics.median(took) < 1.0
+
+
+def waiting(api: TestClient) -> float:
+    """Requests that are being answered, but for the one that asks."""
+    shown = api.get("/metrics").text.splitlines()
+    return next(float(line.split()[1]) for line in shown if "_in_progress " in line and line[0] != "#") - 1.0
+
+
+def ended(answers: Sequence[Future[Any]]) -> int:
+    return sum(answer.done() for answer in answers)
 
 
 def test_only_an_upgrade_makes_a_file(tmp_path: Path) -> None:
