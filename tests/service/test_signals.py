@@ -21,6 +21,9 @@ from tests.service.service_process import ROOT, eventually
 _MARK = "HOSTLENS_DRILL_MARK"
 
 
+SLOW = re.compile("pydantic_core|numpy")
+
+
 def handles(pid: int, number: int) -> bool:
     """Whether a process has a handler of its own for a signal: before that it dies of it, whatever it is."""
     status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
@@ -99,9 +102,7 @@ def test_a_service_that_is_stopped_at_any_moment_of_its_start_ends_with_0_and_le
             code = code_after(process, number, delay_s)
             said = (tmp_path / "log").read_text(errors="replace")
             assert code == 0, (delay_s, number, said[-3000:])
-            eventually(
-                lambda mark=mark: left(mark) == [], PATIENCE_S, f"the end of all, {delay_s:.2f} s after the start"
-            )
+            eventually(lambda mark=mark: left(mark) == [], what=f"the end of all, {delay_s:.2f} s after the start")
             assert "Traceback" not in said, (delay_s, number, said[-3000:])
         finally:
             for each in left(mark):
@@ -113,7 +114,7 @@ def test_a_command_that_is_stopped_says_that_its_work_is_not_done_and_leaves_nob
     command: tuple[str, ...], tmp_path: Path
 ) -> None:
     chance = random.Random(command[0])
-    for place in range(4):
+    for place in range(3):
         delay_s, number = 3.0 * chance.random() * bool(place), (signal.SIGTERM, signal.SIGINT)[place % 2]
         mark = f"{command[0]}-{os.getpid()}-{place}-{time.time_ns()}"
         process = start(tmp_path, mark, "service", *command)
@@ -122,7 +123,7 @@ def test_a_command_that_is_stopped_says_that_its_work_is_not_done_and_leaves_nob
             said = (tmp_path / "log").read_text(errors="replace")
             # Zero where it was done before the signal came.
             assert code in {0, 128 + number}, (delay_s, number, code, said[-3000:])
-            eventually(lambda mark=mark: left(mark) == [], PATIENCE_S, "the end of all")
+            eventually(lambda mark=mark: left(mark) == [], what="the end of all")
             assert "Traceback" not in said, (delay_s, number, said[-3000:])
         finally:
             for each in left(mark):
@@ -138,8 +139,8 @@ def test_the_handlers_are_there_before_anything_that_takes_time_to_load(tmp_path
             while not can_handle(process):
                 assert process.poll() is None
                 loaded = Path(f"/proc/{process.pid}/maps").read_text(encoding="utf-8")
-                assert "pydantic_core" not in loaded, command
-                assert "numpy" not in loaded, command
+                # Since the last look at the handlers they may have come, and all else after them.
+                assert not SLOW.search(loaded) or can_handle(process), command
         finally:
             process.terminate()
             assert process.wait(PATIENCE_S) == 0
