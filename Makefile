@@ -51,9 +51,10 @@ lint: install-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# More processes than cores: tests that start services wait for them most of the time. Who runs what is said in
-# tests/conftest.py.
+# The kernels are compiled once, and not by each process for itself. More processes than cores: tests that start services
+# wait for them most of the time. Who runs what is said in tests/conftest.py.
 test: lint
+	$(BIN)/python -c 'from service.worker import warm_up; warm_up()'
 	$(BIN)/python -m pytest -n $$(( $$(nproc) + $$(nproc) / 2 ))
 
 # One at a time: some of them measure.
