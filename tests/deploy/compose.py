@@ -84,7 +84,7 @@ class Topology:
         kind, program, *arguments = self.services[name]["healthcheck"]["test"]
         assert (kind, program) == ("CMD", "python")
         check = [sys.executable, *(self.here(part, instance) for part in arguments)]
-        return subprocess.run(check, capture_output=True, check=False, timeout=20).returncode == 0
+        return subprocess.run(check, capture_output=True, check=False, timeout=120).returncode == 0
 
     def instances(self) -> dict[str, str]:
         """Name of the service of each container that stays, those that are waited for first."""

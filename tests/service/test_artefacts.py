@@ -228,7 +228,7 @@ def silent(*places: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        until = time.monotonic() + 30
+        until = time.monotonic() + 120
         while any(thread.name == "artefacts" for thread in threading.enumerate()) and time.monotonic() < until:
             for place in places:
                 with suppress(OSError):  # nobody waits there any more
