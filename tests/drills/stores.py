@@ -104,6 +104,6 @@ def _held(service: Installation, grid_id: str) -> int:
 
 
 def _figures_shown(service: Installation, grid_id: str) -> int:
-    with httpx.Client(base_url=f"http://127.0.0.1:{service.port}") as asking:
+    with httpx.Client(base_url=f"http://127.0.0.1:{service.port}", timeout=60.0) as asking:
         runs = asking.get(f"/v1/grids/{grid_id}/runs?limit=1000").json()["items"]
         return sum(asking.get(f"/v1/runs/{run['id']}/figure").status_code == 200 for run in runs)
