@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Generator
+from pathlib import Path
 
 # Before anything loads them: several processes of tests share the machine, and a worker of the service has one core.
 for _library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
@@ -11,6 +12,7 @@ import pytest  # noqa: E402 - after the variables
 from xdist.remote import Producer  # noqa: E402
 from xdist.scheduler import LoadScopeScheduling  # noqa: E402
 
+ROOT = Path(__file__).resolve().parents[1]
 APART = (
     "tests/test_end_to_end.py",
     "tests/service/test_stalls.py",
@@ -42,7 +44,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Schedul
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with what takes longest."""
+    """Begin with what takes longest.
+
+    Raises
+    ------
+    FileNotFoundError
+        A file of that list is no more.
+    """
+    for file in APART:
+        (ROOT / file).stat()
     place = {file: number for number, file in enumerate(APART)}
     items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(place)))
 
