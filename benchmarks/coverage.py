@@ -27,8 +27,8 @@ from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.run import Truth
-from engine.scene import power_law_lens
-from engine.spec import MassModel
+from engine.simulation.scene import power_law_lens
+from engine.spec.sky import MassModel
 
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "docs" / "tables" / "coverage.md"

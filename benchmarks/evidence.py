@@ -25,26 +25,31 @@ from benchmarks.peers import interpreter, missing
 from benchmarks.timing import in_turns, least
 from engine.conventions import FloatArray, pixel_centres
 from engine.imaging.observation import Observation
-from engine.inversion.blurring import blurring_matrix, central_stamp
-from engine.inversion.coupling import curvature_matrix
-from engine.inversion.evidence import ln_evidence
-from engine.inversion.mapping import Mapping, SourceGrid, cast_rays, map_rays
-from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.inversion.problem import Problem, prepare_problem
-from engine.inversion.regularisation import SourceModel, regularisation_matrix
-from engine.inversion.strength import find_strength
+from engine.imaging.optics.stamp_matrix import blurring_matrix, central_stamp
 from engine.lensing.power_law import PowerLawLens, deflection, kernel_arguments
-from engine.modelling.parametric import fit_parametric
-from engine.scene import build_scene
-from engine.simulation import simulate
-from engine.spec import Analysis, Host, Realization
+from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
+from engine.likelihood.evidence import ln_evidence
+from engine.likelihood.problem import Problem, prepare_problem
+from engine.likelihood.strength import find_strength
+from engine.likelihood.w_tilde import curvature_matrix
+from engine.parametric.fit import fit_parametric
+from engine.simulation.scene import build_scene
+from engine.simulation.simulate import simulate
+from engine.source.grid import SourceGrid
+from engine.source.lensing_matrix import LensingMatrix, cast_rays, map_rays
+from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.spec.analysis import Analysis
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 
 
-def dense_ln_evidence(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> float:
+def dense_ln_evidence(
+    likelihood: MarginalLikelihood, lens: PowerLawLens, ln_lambda: float, model: SourceModel
+) -> float:
     """The same number from explicit matrices, amplitudes as extra columns."""
-    mapping = map_rays(operator.rays, kernel_arguments(lens), model.shape)
-    white = operator.whitened
-    g = np.hstack([white.noise.whiten(operator.blurring @ mapping.dense()), white.columns])
+    mapping = map_rays(likelihood.rays, kernel_arguments(lens), model.shape)
+    white = likelihood.whitened
+    g = np.hstack([white.noise.whiten(likelihood.blurring @ mapping.dense()), white.columns])
     n, k = model.shape[0] * model.shape[1], white.columns.shape[1]
     h = regularisation_matrix(model)
     a = g.T @ g
@@ -102,13 +107,13 @@ def against_autolens(observation: Observation, problem: Problem, lens: PowerLawL
                 rays = cast_rays(problem.mask, problem.mask, *axes, observation.pixel_scale, subrays)
                 data, variance = observation.image[problem.mask], observation.noise[problem.mask] ** 2
                 linear = LinearData(data, variance, np.zeros((data.size, 0)))
-                operator = build_operator(linear, blurring_matrix(psf, pixels, pixels), rays)
-                f = curvature_matrix(operator.coupling, operator.border, padded(theirs["mapping"][order], side))
+                likelihood = marginalise_amplitudes(linear, blurring_matrix(psf, pixels, pixels), rays)
+                f = curvature_matrix(likelihood.w_tilde, likelihood.border, padded(theirs["mapping"][order], side))
                 f = np.tril(f) + np.tril(f, -1).T
                 h = theirs["regularization"]
-                d = theirs["mapping"][order].T @ operator.wd
+                d = theirs["mapping"][order].T @ likelihood.wd
                 solution = np.linalg.solve(f + h, d)
-                value = -0.5 * (operator.dd - d @ solution) + operator.ln_constant
+                value = -0.5 * (likelihood.dd - d @ solution) + likelihood.ln_constant
                 value += 0.5 * (np.linalg.slogdet(h)[1] - np.linalg.slogdet(f + h)[1])
                 f_error = float(np.abs(f - theirs["curvature"]).max() / np.abs(f).max())
                 print(
@@ -119,7 +124,7 @@ def against_autolens(observation: Observation, problem: Problem, lens: PowerLawL
                 assert abs(value - float(theirs["log_evidence"])) < 1e-6 * abs(value)
                 model = SourceModel((side, side), "gradient")
                 times: dict[str, list[float]] = {"peer": [], "same": [], "full": []}
-                cases = {"same": operator, "full": problem.operator}
+                cases = {"same": likelihood, "full": problem.likelihood}
                 for _ in range(9):
                     peer.stdin.write("\n")
                     peer.stdin.flush()
@@ -136,7 +141,7 @@ def against_autolens(observation: Observation, problem: Problem, lens: PowerLawL
                 )
 
 
-def padded(mapping: FloatArray, side: int) -> Mapping:
+def padded(mapping: FloatArray, side: int) -> LensingMatrix:
     """A dense L as ours."""
     entries = (mapping != 0).sum(axis=1).astype(np.int32)
     columns = np.zeros((entries.size, int(entries.max())), dtype=np.int32)
@@ -145,12 +150,12 @@ def padded(mapping: FloatArray, side: int) -> Mapping:
         found = np.flatnonzero(values)
         columns[row, : found.size], weights[row, : found.size] = found, values[found]
     nodes = np.arange(float(side))
-    return Mapping(SourceGrid(nodes, nodes), columns, weights, entries)
+    return LensingMatrix(SourceGrid(nodes, nodes), columns, weights, entries)
 
 
 @dataclass(frozen=True)
 class Case:
-    """An operator by its name, and a source for it."""
+    """A likelihood by its name, and a source for it."""
 
     analysis: str
     side: int
@@ -182,18 +187,18 @@ def main() -> None:
             "paper": prepare_problem(observation, fit, Analysis(profile="paper")),
             "standard": prepare_problem(observation, fit, Analysis()),
         }
-        rays = problems["paper"].operator.rays.pixels
-        print(f"mask {problems['paper'].operator.data_points} pixels, rays of {rays} pixels, one core")
+        rays = problems["paper"].likelihood.rays.pixels
+        print(f"mask {problems['paper'].likelihood.data_points} pixels, rays of {rays} pixels, one core")
         print(f"{'profile':>9} {'source':>7} {'ours ms':>8} {'dense ms':>9} {'BLAS ms':>8} {'/BLAS':>6} error")
         for case in CASES:
-            operator = problems[case.analysis].operator
+            likelihood = problems[case.analysis].likelihood
             model = SourceModel((case.side, case.side))
-            strength = find_strength(operator, scene.lens, model).ln_lambda
-            exact = dense_ln_evidence(operator, scene.lens, strength, model)
-            ours = ln_evidence(operator, scene.lens, strength, model)
+            strength = find_strength(likelihood, scene.lens, model).ln_lambda
+            exact = dense_ln_evidence(likelihood, scene.lens, strength, model)
+            ours = ln_evidence(likelihood, scene.lens, strength, model)
             assert abs(ours - exact) < RELATIVE * abs(exact), (case, ours, exact)
-            evaluate = partial(ln_evidence, operator, scene.lens, strength, model)
-            slow = least(partial(dense_ln_evidence, operator, scene.lens, strength, model), 1, clock=time.thread_time)
+            evaluate = partial(ln_evidence, likelihood, scene.lens, strength, model)
+            slow = least(partial(dense_ln_evidence, likelihood, scene.lens, strength, model), 1, clock=time.thread_time)
             fast, syrk, potrf = in_turns(evaluate, *yardstick(1850, case.side**2), clock=time.thread_time)
             blas_time = syrk + potrf
             times = f"{fast * 1e3:8.1f} {slow * 1e3:9.1f} {blas_time * 1e3:8.1f} {fast / blas_time:6.2f}"

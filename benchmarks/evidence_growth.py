@@ -19,12 +19,12 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import least
 from engine.conventions import pixel_centres
-from engine.inversion.blurring import blurring_matrix
-from engine.inversion.evidence import ln_evidence
-from engine.inversion.mapping import cast_rays
-from engine.inversion.operator import LinearData, build_operator
-from engine.inversion.regularisation import SourceModel
+from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.lensing.power_law import PowerLawLens
+from engine.likelihood.amplitudes import LinearData, marginalise_amplitudes
+from engine.likelihood.evidence import ln_evidence
+from engine.source.lensing_matrix import cast_rays
+from engine.source.regularisation import SourceModel
 
 TABLE = Path(__file__).resolve().parent.parent / "docs" / "tables" / "evidence.md"
 SCALE = 0.05
@@ -67,13 +67,13 @@ def measure(case: Case) -> dict[str, float]:
         covariance = deviations @ near @ deviations
     linear = LinearData(rng.normal(size=m), covariance, rng.normal(size=(m, case.amplitudes)))
     began = time.thread_time()
-    operator = build_operator(
+    likelihood = marginalise_amplitudes(
         linear, blurring_matrix(psf / psf.sum(), np.nonzero(mask), np.nonzero(mask | margin)), rays
     )
     prepared = time.thread_time() - began
     lens = PowerLawLens(theta_E, 0.8, 0.4, 2.05)
     model = SourceModel((case.side, case.side), "gradient")
-    evaluation = least(lambda: ln_evidence(operator, lens, 0.0, model), 5, time.thread_time)
+    evaluation = least(lambda: ln_evidence(likelihood, lens, 0.0, model), 5, time.thread_time)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {"pixels": m, "ms": 1e3 * evaluation, "prepared": prepared, "mib": peak}
 

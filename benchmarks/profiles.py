@@ -20,7 +20,7 @@ from engine import Analysis, Host, Realization, measure, simulate_realization
 from engine.catalogue import system_names
 from engine.digest import engine_digest
 from engine.run import Measurement
-from engine.spec import ProfileName
+from engine.spec.analysis import ProfileName
 
 TABLE = Path(__file__).resolve().parent.parent / "docs" / "tables" / "profiles.md"
 PROFILES: tuple[ProfileName, ...] = ("reference", "standard", "draft")

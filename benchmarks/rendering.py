@@ -26,9 +26,10 @@ from engine.conventions import pixel_centres
 from engine.lensing.power_law import PowerLawLens, deflection
 from engine.light.rendering import render_sersic, sample_lensed_sersic
 from engine.light.sersic import SersicProfile, sersic_k, sersic_normalisation
-from engine.scene import build_scene
-from engine.simulation import scene_geometry, simulate
-from engine.spec import Host, Realization
+from engine.simulation.scene import build_scene
+from engine.simulation.simulate import scene_geometry, simulate
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 from tests.engine.light_oracle import flux_through_the_sides, graded_fluxes
 
 LENS = PowerLawLens(1.2171, 0.85, 1.29, 2.0)

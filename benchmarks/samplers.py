@@ -19,8 +19,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from engine import Analysis, Host, Realization, simulate_realization
-from engine.inversion.problem import prepare_problem
-from engine.modelling.parametric import fit_parametric
+from engine.likelihood.problem import prepare_problem
+from engine.parametric.fit import fit_parametric
 from engine.posterior.chain import run_chain
 from engine.posterior.optimum import Laplace, find_optimum
 from engine.posterior.target import Target

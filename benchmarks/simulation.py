@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from benchmarks.timing import least
 from engine.catalogue import camera_names, load_camera, load_dither, read_catalogue, system_names
 from engine.conventions import FloatArray
-from engine.imaging.blurring import convolve, point_source_image
+from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.cusps import place_cusps
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
 from engine.imaging.exposures import expose
@@ -35,9 +35,10 @@ from engine.imaging.psf import (
 )
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
-from engine.scene import Scene, build_scene
-from engine.simulation import optical_psf, scene_geometry, simulate
-from engine.spec import Host, Realization
+from engine.simulation.scene import Scene, build_scene
+from engine.simulation.simulate import optical_psf, scene_geometry, simulate
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 from tests.engine.angular_solver import AngularSolver
 from tests.engine.light_oracle import flux_through_the_sides, graded_fluxes
 

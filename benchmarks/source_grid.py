@@ -3,8 +3,8 @@
     python -m benchmarks.source_grid [--systems HE0435 ...]
 
 Each system is simulated with hosts of n = 2 and 4 and inverted at the true lens, with lambda at its optimum for the
-noisy data. The residual is that of the noise-free data under the same operator and lambda: what no source of that grid
-can describe. Its parametric fit is that of the noisy data. Independent noise everywhere, as in the profile ``paper``.
+noisy data. The residual is that of the noise-free data under the same likelihood and lambda: what no source of that
+grid can describe. Its parametric fit is that of the noisy data. Independent noise everywhere, as in ``paper``.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from engine.catalogue import read_catalogue, system_names
 from engine.conventions import FloatArray
 from engine.errors import EngineError
 from engine.imaging.drizzling import drizzle
-from engine.inversion.evidence import invert, ln_evidence
-from engine.inversion.operator import Operator
-from engine.inversion.problem import Problem, prepare_problem
-from engine.inversion.regularisation import SourceModel
-from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens
-from engine.modelling.parametric import fit_parametric
-from engine.simulation import Simulation, simulate_realization
+from engine.likelihood.amplitudes import MarginalLikelihood
+from engine.likelihood.evidence import invert, ln_evidence
+from engine.likelihood.problem import Problem, prepare_problem
+from engine.likelihood.strength import find_strength
+from engine.parametric.fit import fit_parametric
+from engine.simulation.simulate import Simulation, simulate_realization
+from engine.source.regularisation import SourceModel
 
 TABLE = Path(__file__).resolve().parent.parent / "docs" / "tables" / "source_grid.md"
 INDICES = (2.0, 4.0)
@@ -84,15 +84,15 @@ def cpu_ms(function: Callable[[], object], repetitions: int = 5) -> float:
     return 1e3 * min(times)
 
 
-def with_data(operator: Operator, data: FloatArray) -> Operator:
-    """The operator of other data (M,) on the same mask with the same noise."""
-    white = operator.whitened
+def with_data(likelihood: MarginalLikelihood, data: FloatArray) -> MarginalLikelihood:
+    """The likelihood of other data (M,) on the same mask with the same noise."""
+    white = likelihood.whitened
     d = white.noise.whiten(data)
     q, _ = np.linalg.qr(white.columns)
     projected = d - q @ (q.T @ d)
     return replace(
-        operator,
-        wd=np.asarray(operator.blurring.T @ white.noise.whiten_transposed(projected)),
+        likelihood,
+        wd=np.asarray(likelihood.blurring.T @ white.noise.whiten_transposed(projected)),
         dd=float(projected @ projected),
         whitened=replace(white, data=d),
     )
@@ -100,15 +100,15 @@ def with_data(operator: Operator, data: FloatArray) -> Operator:
 
 def measure(problem: Problem, clean: FloatArray, noise: FloatArray, lens: PowerLawLens, layout: Layout) -> Point:
     """One layout: ``clean`` (ny, nx) is the image without noise, ``noise`` (ny, nx) its standard deviation."""
-    operator, model, mask = problem.operator, layout.model, problem.mask
-    found = find_strength(operator, lens, model)
-    ln_z = ln_evidence(operator, lens, found.ln_lambda, model)
-    bare = with_data(operator, clean[mask])
+    likelihood, model, mask = problem.likelihood, layout.model, problem.mask
+    found = find_strength(likelihood, lens, model)
+    ln_z = ln_evidence(likelihood, lens, found.ln_lambda, model)
+    bare = with_data(likelihood, clean[mask])
     inversion = invert(bare, lens, found.ln_lambda, model)
-    arc = bare.blurring @ inversion.mapping.apply(inversion.source.ravel())
+    arc = bare.blurring @ inversion.lensing.apply(inversion.source.ravel())
     image = arc + problem.amplitude_images[:, mask].T @ bare.fit_amplitudes(arc)
     residual = ((clean[mask] - image) / noise[mask])[~problem.core[mask]]
-    ms = cpu_ms(lambda: ln_evidence(operator, lens, found.ln_lambda, model))
+    ms = cpu_ms(lambda: ln_evidence(likelihood, lens, found.ln_lambda, model))
     rms = float(np.sqrt(np.mean(residual**2)))
     return Point(rms, float(np.abs(residual).max()), ln_z, found.effective_parameters, ms)
 
@@ -143,7 +143,7 @@ def of_system(system: str, n: float) -> tuple[str, list[Point]]:
     prepared = problems(simulation)
     observation, lens = simulation.observation, simulation.scene.lens
     points = [measure(prepared[each.envelope], clean, observation.noise, lens, each) for each in LAYOUTS]
-    data = prepared[True].operator.data_points
+    data = prepared[True].likelihood.data_points
     heading = f"{system}, n = {n:g}, {host.magnitude:g} mag, R_eff = {host.r_eff:g} arcsec, {data:,} pixels"
     return heading, points
 

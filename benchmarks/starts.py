@@ -19,8 +19,8 @@ import numpy as np
 
 from engine import EngineError, Grid, Realization, expand, simulate_realization, system_names
 from engine.conventions import rate_to_magnitude
-from engine.modelling.parametric import ParametricFit, fit_parametric
-from engine.scene import Scene
+from engine.parametric.fit import ParametricFit, fit_parametric
+from engine.simulation.scene import Scene
 
 _CLOSE = (0.02, 0.1, 0.2, 0.5)
 """What counts as close in the last line: relative theta_E, q, slope and host magnitude."""

@@ -13,17 +13,19 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import least
 from engine.conventions import FloatArray
-from engine.inversion.evidence import ln_evidence, normal_equations
-from engine.inversion.mapping import map_rays
-from engine.inversion.operator import Operator
-from engine.inversion.problem import prepare_problem
-from engine.inversion.regularisation import SourceModel, add_regularisation, ln_determinant, regularisation_matrix
-from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens, kernel_arguments
-from engine.modelling.parametric import fit_parametric
-from engine.scene import build_scene
-from engine.simulation import simulate
-from engine.spec import Analysis, Host, Realization
+from engine.likelihood.amplitudes import MarginalLikelihood
+from engine.likelihood.evidence import ln_evidence, normal_equations
+from engine.likelihood.problem import prepare_problem
+from engine.likelihood.strength import find_strength
+from engine.parametric.fit import fit_parametric
+from engine.simulation.scene import build_scene
+from engine.simulation.simulate import simulate
+from engine.source.lensing_matrix import map_rays
+from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant, regularisation_matrix
+from engine.spec.analysis import Analysis
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 
 MODELS = (
     SourceModel((30, 30), "curvature"),
@@ -33,9 +35,9 @@ MODELS = (
 )
 
 
-def brent(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[float, int]:
+def brent(likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel) -> tuple[float, int]:
     """Ln lambda and the number of factorisations."""
-    f, d = normal_equations(operator, lens, model)
+    f, d = normal_equations(likelihood, lens, model)
     count = 0
 
     def minus_ln_evidence(ln_lambda: float) -> float:
@@ -57,17 +59,19 @@ def brent(operator: Operator, lens: PowerLawLens, model: SourceModel) -> tuple[f
     return float(found.x), count
 
 
-def single_precision(operator: Operator, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, ...]:
+def single_precision(
+    likelihood: MarginalLikelihood, lens: PowerLawLens, ln_lambda: float, model: SourceModel
+) -> tuple[float, ...]:
     """Errors of ln Z where W, or W, L and their products, or the factorisation too are in float32."""
-    exact = ln_evidence(operator, lens, ln_lambda, model)
-    f, d = normal_equations(operator, lens, model)
+    exact = ln_evidence(likelihood, lens, ln_lambda, model)
+    f, d = normal_equations(likelihood, lens, model)
     f = np.tril(f) + np.tril(f, -1).T
-    dense = map_rays(operator.rays, kernel_arguments(lens), model.shape).dense()
-    w = operator.coupling.dense() - operator.border @ operator.border.T
+    dense = map_rays(likelihood.rays, kernel_arguments(lens), model.shape).dense()
+    w = likelihood.w_tilde.dense() - likelihood.border @ likelihood.border.T
     rounded_w = w.astype(np.float32).astype(np.float64)
     single = (dense.T.astype(np.float32) @ (w.astype(np.float32) @ dense.astype(np.float32))).astype(np.float64)
     h = math.exp(ln_lambda) * regularisation_matrix(model)
-    constant = operator.ln_constant - 0.5 * operator.dd + 0.5 * (ln_determinant(model) + d.size * ln_lambda)
+    constant = likelihood.ln_constant - 0.5 * likelihood.dd + 0.5 * (ln_determinant(model) + d.size * ln_lambda)
 
     def value(f: FloatArray, dtype: type) -> float:
         a = (f + h).astype(dtype)
@@ -87,24 +91,24 @@ def main() -> None:
     with threadpool_limits(1):
         scene = build_scene(spec)
         observation = simulate(scene, "author", np.random.default_rng(0)).observation
-        operator = prepare_problem(observation, fit_parametric(observation, agn_images=4), Analysis()).operator
+        likelihood = prepare_problem(observation, fit_parametric(observation, agn_images=4), Analysis()).likelihood
         lens = scene.lens
         print(f"{'':>24} {'Brent':>20} {'Newton':>20}")
         for model in MODELS:
-            newton = find_strength(operator, lens, model)
-            old, count = brent(operator, lens, model)
+            newton = find_strength(likelihood, lens, model)
+            old, count = brent(likelihood, lens, model)
             assert abs(old - newton.ln_lambda) < 2e-2, (old, newton)
             times = (
-                least(lambda model=model: brent(operator, lens, model), 3),
-                least(lambda model=model: find_strength(operator, lens, model), 3),
+                least(lambda model=model: brent(likelihood, lens, model), 3),
+                least(lambda model=model: find_strength(likelihood, lens, model), 3),
             )
             name = f"{model.regularisation} {model.shape[0]}x{model.shape[1]}"
             counts = (count, newton.factorisations)
             cells = " ".join(f"{k:>4} x {t * 1e3:9.0f} ms " for k, t in zip(counts, times, strict=True))
             print(f"{name:>24} {cells}")
         model = MODELS[0]
-        strength = find_strength(operator, lens, model).ln_lambda
-        errors = single_precision(operator, lens, strength, model)
+        strength = find_strength(likelihood, lens, model).ln_lambda
+        errors = single_precision(likelihood, lens, strength, model)
         print("error of ln Z with float32: W {:.1e}; W, L and F {:.1e}; the factorisation {:.1e}".format(*errors))
 
 

@@ -9,7 +9,6 @@ import engine.home  # noqa: F401 - before Astropy is imported
 
 from engine.acceptance import check_realization
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
-from engine.catalogue.user_files import read_camera, read_mapping, read_system
 from engine.digest import engine_digest, engine_versions
 from engine.errors import (
     EngineError,
@@ -33,37 +32,32 @@ from engine.grid import (
     expand,
     preset_names,
 )
+from engine.imaging.external import NoiseFromImage, observation_from_arrays
+from engine.imaging.external_files import read_external_observation
 from engine.imaging.fits import read_observation, write_observation
-from engine.imaging.foreign import NoiseFromImage, observation_from_arrays
-from engine.imaging.foreign_files import read_foreign_observation
 from engine.imaging.observation import Observation
 from engine.inspection import InversionView, inspect_inversion, inspect_simulation
-from engine.json_text import read_json
-from engine.measurement import HostEstimate, ImageMeasurement, Measured, measure_image
+from engine.measure import HostEstimate, ImageMeasurement, Measured, measure_image
 from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
 from engine.run import STAGES, Measurement, Truth, measure, run
-from engine.scene import check_analysis, check_system
-from engine.seeds import generator
-from engine.simulation import Simulation, simulate_realization
-from engine.spec import (
-    PROFILES,
-    Analysis,
-    Camera,
-    CameraChoice,
-    Host,
-    Identifier,
-    LensSystem,
-    NoiseLevel,
-    Optics,
-    ParameterPrior,
+from engine.simulation.scene import check_analysis, check_system
+from engine.simulation.seeds import generator
+from engine.simulation.simulate import Simulation, simulate_realization
+from engine.spec.analysis import PROFILES, Analysis
+from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
+from engine.spec.json_text import read_json
+from engine.spec.priors import ParameterPrior
+from engine.spec.quantities import Identifier
+from engine.spec.realization import (
     Realization,
-    SystemChoice,
     camera_from_mapping,
     realization_from_dict,
     spec_digest,
     system_from_mapping,
 )
-from engine.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
+from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
+from engine.user_files import read_camera, read_mapping, read_system
 
 __all__ = [
     "PRINTABLE",
@@ -134,7 +128,7 @@ __all__ = [
     "path_steps",
     "preset_names",
     "read_camera",
-    "read_foreign_observation",
+    "read_external_observation",
     "read_json",
     "read_mapping",
     "read_observation",

@@ -8,8 +8,8 @@ from engine.errors import SpecError
 from engine.imaging.geometry import exposure_geometry
 from engine.imaging.psf import coarsest_subpixel
 from engine.posterior.target import wide_prior
-from engine.scene import check_analysis, power_law_lens, resolve_camera, resolve_dither, resolve_system
-from engine.spec import Realization
+from engine.simulation.scene import check_analysis, power_law_lens, resolve_camera, resolve_dither, resolve_system
+from engine.spec.realization import Realization
 
 _MOST_SUBPIXELS = 8192
 """Along a side of the high-resolution image or of the PSF: 0.5 GB an array."""
@@ -22,7 +22,7 @@ def check_realization(realization: Realization) -> None:
 
     Camera and dither pattern must sample the telescope's PSF and fit into memory, priors must leave something of each
     parameter, and the analysis must ask for nothing that the system has not. What its values are by themselves was
-    checked when it was made, and a system of one's own by :func:`~engine.scene.check_system`.
+    checked when it was made, and a system of one's own by :func:`~engine.simulation.scene.check_system`.
 
     Raises
     ------

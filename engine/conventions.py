@@ -5,7 +5,7 @@ specifications use it.
 
 *Image frame*: x along increasing pixel columns, y along increasing pixel rows, arcsec, origin at the centre of the
 image; angles in radians counter-clockwise from +x. Images are North up, East left, so ``x_image = -x_East``. All
-numeric modules use it; :mod:`engine.scene` is the one place that converts.
+numeric modules use it; :mod:`engine.simulation.scene` is the one place that converts.
 
 Einstein radii and half-light radii are on the intermediate axis, ``R = sqrt(q x^2 + y^2 / q)`` with x along the major
 axis; magnitudes are AB; surface brightness is in e-/s per pixel.

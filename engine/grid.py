@@ -21,24 +21,11 @@ from engine.catalogue import (
     system_names,
 )
 from engine.errors import SpecError
-from engine.spec import (
-    Analysis,
-    Camera,
-    CameraChoice,
-    Count,
-    Dither,
-    Host,
-    Identifier,
-    LensSystem,
-    Magnitude,
-    NoiseLevel,
-    Optics,
-    Radius,
-    Realization,
-    SersicIndex,
-    Slope,
-    SystemChoice,
-)
+from engine.spec.analysis import Analysis
+from engine.spec.instrument import Camera, CameraChoice, Dither, NoiseLevel, Optics
+from engine.spec.quantities import Count, Identifier, Magnitude, Radius, SersicIndex, Slope
+from engine.spec.realization import Realization
+from engine.spec.sky import Host, LensSystem, SystemChoice
 
 PAPER = "h0licow-vi"
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)

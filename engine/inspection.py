@@ -8,16 +8,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from engine.imaging.observation import Observation
-from engine.inversion.evidence import Inversion
-from engine.inversion.problem import prepare_problem
-from engine.inversion.resolution import SourceResolution, source_resolution
-from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.likelihood.evidence import Inversion
+from engine.likelihood.problem import prepare_problem
+from engine.likelihood.resolution import SourceResolution, source_resolution
+from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum
 from engine.posterior.traces import EvidenceTrace, trace_evidence
 from engine.result import Products
 from engine.run import Truth, find_start, prepare_target, products_of
-from engine.simulation import Simulation
-from engine.spec import Analysis
+from engine.simulation.simulate import Simulation
+from engine.spec.analysis import Analysis
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def inspect_inversion(
         traces=trace_evidence(target, names, optimum.mean, optimum.covariance, truth=true),
         effective_parameters=gamma,
         chi2=chi2,
-        degrees_of_freedom=int((problem.mask & ~problem.core).sum()) - problem.operator.amplitudes - round(gamma),
+        degrees_of_freedom=int((problem.mask & ~problem.core).sum()) - problem.likelihood.amplitudes - round(gamma),
     )
 
 

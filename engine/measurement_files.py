@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
-from engine.measurement import ImageMeasurement
+from engine.measure import ImageMeasurement
 
 
 def write_measurement(path: str | Path, found: ImageMeasurement) -> None:
     """Write the image and, on the same pixels, MODEL, ARC (lensed host), RESIDUAL and SIGMA [e-/s] of the fit.
 
     SIGMA is infinite where a pixel was not fitted. The extension RESULT holds what
-    :meth:`~engine.measurement.ImageMeasurement.to_dict` says, as JSON text in one cell.
+    :meth:`~engine.measure.ImageMeasurement.to_dict` says, as JSON text in one cell.
     """
     fit, observation = found.fit, found.observation
     planes = {

@@ -21,23 +21,21 @@ from engine.catalogue import load_system
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import SpecError
+from engine.estimators.draws import DrawSet, source_draw
+from engine.estimators.refit import refit_draws
+from engine.estimators.sersic_fit import Refit
+from engine.estimators.summaries import summarise, summarise_aperture
 from engine.imaging.observation import Observation
-from engine.inversion.evidence import Inversion
-from engine.inversion.mapping import SourceGrid
-from engine.inversion.problem import Problem, prepare_problem
-from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
 from engine.light.cell_means import profile_on_grid
 from engine.light.sersic import SersicProfile, mean_surface_brightness
-from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.likelihood.evidence import Inversion
+from engine.likelihood.problem import Problem, prepare_problem
+from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Target, wide_prior
-from engine.refits.draws import DrawSet, source_draw
-from engine.refits.estimators import refit_draws
-from engine.refits.sersic_fit import Refit
-from engine.refits.summaries import summarise, summarise_aperture
 from engine.result import (
     ESTIMATORS,
     Aperture,
@@ -48,9 +46,13 @@ from engine.result import (
     RunResult,
     StageTime,
 )
-from engine.seeds import generator
-from engine.simulation import simulate_realization
-from engine.spec import NOMINAL_OPTICS, Analysis, Realization
+from engine.simulation.seeds import generator
+from engine.simulation.simulate import simulate_realization
+from engine.source.grid import SourceGrid
+from engine.source.regularisation import SourceModel
+from engine.spec.analysis import Analysis
+from engine.spec.instrument import NOMINAL_OPTICS
+from engine.spec.realization import Realization
 
 Progress = Callable[[str, float], None]
 STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
@@ -124,9 +126,9 @@ def products_of(
     truth: Truth | None,
 ) -> tuple[Products, float]:
     """Maps for figures and files of an inversion with the samples (n, d) it is one of, and its chi^2."""
-    operator, mask = problem.operator, problem.mask
-    arc = operator.blurring @ best.mapping.apply(best.source.ravel())
-    amplitudes = operator.fit_amplitudes(arc)
+    likelihood, mask = problem.likelihood, problem.mask
+    arc = likelihood.blurring @ best.lensing.apply(best.source.ravel())
+    amplitudes = likelihood.fit_amplitudes(arc)
     arc_image = np.zeros(observation.shape)
     arc_image[mask] = arc
     model = arc_image + np.tensordot(amplitudes, problem.amplitude_images, axes=1)
@@ -149,7 +151,7 @@ def products_of(
         chain=samples,
         parameter_names=names,
     )
-    return products, operator.chi2(arc, amplitudes)
+    return products, likelihood.chi2(arc, amplitudes)
 
 
 def _refit(
@@ -182,13 +184,13 @@ def prepare_target(problem: Problem, fit: ParametricFit, analysis: Analysis, *, 
         analysis.regularisation,
     )
     prior = wide_prior(fit.lens, shear=shear).restricted(analysis.priors)
-    anchors = problem.operator.rays.anchors
+    anchors = problem.likelihood.rays.anchors
     agn = None
     if analysis.agn_position_sd is not None:
         if len(anchors) < 2:
             raise SpecError("agn_position_sd", analysis.agn_position_sd, "nothing where there are no two AGN images")
         agn = AgnPositions(anchors, analysis.agn_position_sd)
-    return Target(problem.operator, prior, source, agn)
+    return Target(problem.likelihood, prior, source, agn)
 
 
 def find_start(target: Target, fit: ParametricFit) -> tuple[FloatArray, FloatArray]:
@@ -283,7 +285,7 @@ def measure(
         best=best,
         ln_evidence=best.ln_evidence,
         chi2=chi2,
-        degrees_of_freedom=fitted - problem.operator.amplitudes - round(best.effective_parameters()),
+        degrees_of_freedom=fitted - problem.likelihood.amplitudes - round(best.effective_parameters()),
         products=products,
         warnings=tuple(warnings),
     )

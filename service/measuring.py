@@ -87,7 +87,7 @@ def _observation(
     """Our own FITS file as it is, or anybody's from its parts."""
     from astropy.io import fits  # noqa: PLC0415 - as the engine
 
-    from engine import ObservationError, read_foreign_observation, read_observation  # noqa: PLC0415
+    from engine import ObservationError, read_external_observation, read_observation  # noqa: PLC0415
 
     if psf is None:
         try:
@@ -105,7 +105,7 @@ def _observation(
         raise typer.BadParameter("--zeropoint: the AB magnitude of 1 e-/s must be given")
     if how["unit"] not in ("e-/s", "e-"):
         raise typer.BadParameter(f"--unit: got {how['unit']!r}, allowed is e-/s or e-")
-    return read_foreign_observation(
+    return read_external_observation(
         image, psf, zero_point=zeropoint, noise=noise, pixel_scale=pixel_scale, recentre_psf="pixel",
         normalise_psf=True, **how,
     )  # fmt: skip

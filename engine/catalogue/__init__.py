@@ -14,8 +14,9 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from engine.errors import SpecError
-from engine.spec import Camera, Dither, LensSystem
-from engine.validation import spec_error
+from engine.spec.instrument import Camera, Dither
+from engine.spec.sky import LensSystem
+from engine.spec.validation import spec_error
 
 _SYSTEM = TypeAdapter(LensSystem)
 _CAMERA = TypeAdapter(Camera)

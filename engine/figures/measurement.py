@@ -23,7 +23,7 @@ from engine.figures.sky import (
     stretch_ticks,
 )
 from engine.light.sersic import surface_brightness
-from engine.measurement import ImageMeasurement
+from engine.measure import ImageMeasurement
 
 _RESIDUAL_LIMIT = 5.0
 _HOST_RADII = 4.0

@@ -22,8 +22,8 @@ from engine.figures.sky import (
 )
 from engine.grid import GridRun
 from engine.imaging.observation import Observation
-from engine.scene import resolve_system
-from engine.simulation import Simulation
+from engine.simulation.scene import resolve_system
+from engine.simulation.simulate import Simulation
 
 # Panels this small show arcs, not the sky.
 _GALLERY_LINEAR = 10.0

@@ -13,7 +13,7 @@ from scipy import fft
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
-from engine.imaging.blurring import point_source_image
+from engine.imaging.convolution import point_source_image
 from engine.imaging.drizzling import drizzle
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, resized

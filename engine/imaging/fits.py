@@ -16,7 +16,7 @@ from scipy import sparse
 from engine.errors import ObservationError
 from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
-from engine.imaging.response import PointResponse
+from engine.imaging.optics.exposed import PointResponse
 
 FORMAT_VERSION = 2
 _KEYWORD = re.compile(r"[A-Z][A-Z0-9_-]{0,7}")

@@ -15,7 +15,7 @@ import numpy as np
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import SpecError
-from engine.spec import Camera, Dither
+from engine.spec.instrument import Camera, Dither
 
 # Native pixels beyond the drizzled image, one on each side: every output pixel must lie under a droplet of
 # each exposure, and a droplet is smaller than the pixel it comes from.

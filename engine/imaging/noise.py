@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
-from engine.spec import AuthorNoise, Camera, ExposurePlan, NoiseLevel
+from engine.spec.instrument import AuthorNoise, Camera, ExposurePlan, NoiseLevel
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
-from engine.imaging.blurring import place_stamp
-from engine.imaging.response import PointResponse
+from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.spline import place_stamp
 
 Provenance = Mapping[str, str | float | int]
 

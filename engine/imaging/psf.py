@@ -4,7 +4,7 @@ Two arrays are told apart. The *optical* PSF is point-sampled: the irradiance at
 times the sub-pixel's area. It is band-limited and sampled above its Nyquist rate. Convolving it with an image
 that is already integrated over the sub-pixels gives the blurred image integrated over the sub-pixels, without
 another box blur, as long as the image is smooth on the scale of a sub-pixel. A point source is not; it is
-integrated over the sub-pixels where it is placed (:func:`engine.imaging.blurring.point_source_image`). The
+integrated over the sub-pixels where it is placed (:func:`engine.imaging.convolution.point_source_image`). The
 *effective* PSF is what a native pixel measures: the optical one integrated over the pixel and spread by the
 detector kernel, sampled at the sub-pixels.
 """
@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from engine.conventions import FloatArray
 from engine.errors import ObservationError, SpecError
 from engine.imaging.pupil import pupil_transmission, pupil_wavefront
-from engine.spec import Camera
+from engine.spec.instrument import Camera
 
 PUPIL_PIXELS = 512
 

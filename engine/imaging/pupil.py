@@ -8,7 +8,7 @@ import numpy as np
 
 from engine.conventions import FloatArray
 from engine.errors import SpecError
-from engine.spec import Pupil
+from engine.spec.instrument import Pupil
 
 ZERNIKE_WAVELENGTH_NM = 547.0
 

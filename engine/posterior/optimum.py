@@ -9,8 +9,8 @@ import numpy as np
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError, PosteriorError
-from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens
+from engine.likelihood.strength import find_strength
 from engine.posterior.target import Recorded, Target
 
 _MAX_ROUNDS = 12
@@ -44,7 +44,7 @@ def optimal_strength(target: Target, lens: PowerLawLens, low: float = -40.0, hig
     """
     low, high = max(low, float(target.prior.low[-1])), min(high, float(target.prior.high[-1]))
     try:
-        found = find_strength(target.operator, lens, target.source, low=low, high=high)
+        found = find_strength(target.likelihood, lens, target.source, low=low, high=high)
     except InversionError as error:
         raise PosteriorError(f"{error} ({lens})") from error
     target.evaluations += found.factorisations

@@ -10,12 +10,12 @@ import numpy as np
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError, SpecError
-from engine.inversion.evidence import Inversion, invert, ln_evidence
-from engine.inversion.operator import Operator
-from engine.inversion.regularisation import SourceModel
 from engine.lensing.power_law import PowerLawLens
+from engine.likelihood.amplitudes import MarginalLikelihood
+from engine.likelihood.evidence import Inversion, invert, ln_evidence
 from engine.posterior.agn_positions import AgnPositions
-from engine.spec import LensParameterName, ParameterPrior
+from engine.source.regularisation import SourceModel
+from engine.spec.priors import LensParameterName, ParameterPrior
 
 LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")
 SHEAR_NAMES = ("gamma1", "gamma2")
@@ -127,7 +127,7 @@ class Target:
     With ``agn``, the positions of the AGN images are data too.
     """
 
-    operator: Operator
+    likelihood: MarginalLikelihood
     prior: Prior
     source: SourceModel
     agn: AgnPositions | None = None
@@ -150,14 +150,14 @@ class Target:
         lens = self.lens(values)
         rest = self.prior.ln_density(values) + (0.0 if self.agn is None else self.agn.ln_likelihood(lens))
         try:
-            return rest + ln_evidence(self.operator, lens, float(values[-1]), self.source)
+            return rest + ln_evidence(self.likelihood, lens, float(values[-1]), self.source)
         except InversionError:
             self.refused += 1
             return -math.inf
 
     def invert(self, values: FloatArray) -> Inversion:
         """The full inversion at a parameter vector."""
-        return invert(self.operator, self.lens(values), float(values[-1]), self.source)
+        return invert(self.likelihood, self.lens(values), float(values[-1]), self.source)
 
 
 @dataclass

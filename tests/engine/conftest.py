@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from engine.scene import Scene, build_scene
-from engine.simulation import Simulation, simulate
-from engine.spec import Analysis, Host, Realization
+from engine.simulation.scene import Scene, build_scene
+from engine.simulation.simulate import Simulation, simulate
+from engine.spec.analysis import Analysis
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 
 QUICK = Analysis(source_pixels=(12, 12), max_steps=10, draws=4)
 """An analysis of seconds, for what does not depend on its quality."""

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from engine.inversion.blurring import blurring_matrix
-from engine.inversion.mapping import cast_rays, map_rays
-from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.inversion.regularisation import SourceModel, regularisation_matrix
+from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
+from engine.source.lensing_matrix import cast_rays, map_rays
+from engine.source.regularisation import SourceModel, regularisation_matrix
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
 SCALE = 0.1
@@ -70,8 +70,8 @@ class Case:
             self.precisions[-1] = amplitude_sd**-2
         self.linear = LinearData(self.data, self.covariance, self.columns, self.precisions)
 
-    def operator(self) -> Operator:
-        return build_operator(self.linear, self.blurring, self.rays)
+    def likelihood(self) -> MarginalLikelihood:
+        return marginalise_amplitudes(self.linear, self.blurring, self.rays)
 
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""

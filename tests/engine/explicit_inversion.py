@@ -8,11 +8,11 @@ import numpy as np
 from scipy.linalg import lu_factor, lu_solve
 from scipy.signal import convolve2d
 
-from engine.inversion.blurring import blurring_matrix
-from engine.inversion.mapping import RayBundle, cast_rays
-from engine.inversion.operator import LinearData, Operator, build_operator
-from engine.inversion.regularisation import SourceModel
+from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.lensing.power_law import PowerLawLens, source_position
+from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
+from engine.source.lensing_matrix import RayBundle, cast_rays
+from engine.source.regularisation import SourceModel
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
 SCALE = 0.1
@@ -40,9 +40,11 @@ def stamp(name: str) -> np.ndarray:
 Pixels = tuple[np.ndarray, np.ndarray]
 
 
-def stamp_operator(linear: LinearData, kernel: np.ndarray, rays: RayBundle, to: Pixels, of: Pixels) -> Operator:
-    """The engine's operator of one PSF kernel between the pixels of the mask and those with rays."""
-    return build_operator(linear, blurring_matrix(kernel, to, of), rays)
+def stamp_likelihood(
+    linear: LinearData, kernel: np.ndarray, rays: RayBundle, to: Pixels, of: Pixels
+) -> MarginalLikelihood:
+    """The engine's likelihood with one PSF kernel between the pixels of the mask and those with rays."""
+    return marginalise_amplitudes(linear, blurring_matrix(kernel, to, of), rays)
 
 
 @dataclass(frozen=True)
@@ -103,10 +105,10 @@ class Explicit:
         data = arc[self.chosen] + 30.0 * u.sum(axis=1) + sigma * rng.normal(size=m)
         return LinearData(data, covariance, np.ascontiguousarray(u))
 
-    def operator(self) -> Operator:
+    def likelihood(self) -> MarginalLikelihood:
         x, y = self.axes
         rays = cast_rays(self.chosen, self.rayed & ~self.chosen, x[0], y[:, 0], SCALE, self.subrays, ANCHORS)
-        return stamp_operator(
+        return stamp_likelihood(
             self.linear, stamp(self.psf), rays, np.nonzero(self.chosen), np.nonzero(self.rayed | self.chosen)
         )
 

@@ -7,19 +7,23 @@ import numpy as np
 import pytest
 
 from engine.imaging.drizzling import drizzle
-from engine.imaging.extended import lensed_sersic_image
-from engine.inversion.evidence import invert, ln_evidence
-from engine.inversion.mapping import Envelope, SourceGrid, map_rays
-from engine.inversion.problem import prepare_problem
-from engine.inversion.regularisation import SourceModel
-from engine.inversion.strength import find_strength
+from engine.imaging.optics.extended import lensed_sersic_image
 from engine.lensing.power_law import kernel_arguments, source_position
 from engine.light.sersic import SersicProfile, surface_brightness
-from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.likelihood.evidence import invert, ln_evidence
+from engine.likelihood.problem import prepare_problem
+from engine.likelihood.strength import find_strength
+from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
 from engine.posterior.target import Target, wide_prior
-from engine.simulation import Simulation, simulate_realization
-from engine.spec import Analysis, Host, Realization
+from engine.simulation.simulate import Simulation, simulate_realization
+from engine.source.envelope import Envelope
+from engine.source.grid import SourceGrid
+from engine.source.lensing_matrix import map_rays
+from engine.source.regularisation import SourceModel
+from engine.spec.analysis import Analysis
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 from tests.engine.dense_oracle import LENS, Case
 
 MODEL = SourceModel(Analysis().source_pixels)
@@ -37,8 +41,8 @@ class Modulated(Case):
 def test_evidence_and_source_are_those_of_explicit_matrices() -> None:
     case, model = Modulated(), SourceModel((9, 11))
     exact, solution, covariance = case.oracle(LENS, 1.0, model)
-    inversion = invert(case.operator(), LENS, 1.0, model)
-    assert ln_evidence(case.operator(), LENS, 1.0, model) == pytest.approx(exact, rel=1e-8)
+    inversion = invert(case.likelihood(), LENS, 1.0, model)
+    assert ln_evidence(case.likelihood(), LENS, 1.0, model) == pytest.approx(exact, rel=1e-8)
     placed = map_rays(case.rays, kernel_arguments(LENS), model.shape).envelope
     assert placed is not None
     brightness = placed.on_cells(inversion.grid)
@@ -49,9 +53,9 @@ def test_evidence_and_source_are_those_of_explicit_matrices() -> None:
 
 def test_the_curvature_is_that_of_the_brightness() -> None:
     case = Modulated()
-    operator, inversion = case.operator(), invert(case.operator(), LENS, 1.0, SourceModel((9, 11)))
-    image = inversion.mapping.apply(inversion.source.ravel())
-    chi2 = float(image @ operator.coupling.dense() @ image - ((operator.border.T @ image) ** 2).sum())
+    likelihood, inversion = case.likelihood(), invert(case.likelihood(), LENS, 1.0, SourceModel((9, 11)))
+    image = inversion.lensing.apply(inversion.source.ravel())
+    chi2 = float(image @ likelihood.w_tilde.dense() @ image - ((likelihood.border.T @ image) ** 2).sum())
     source = inversion.source.ravel()
     assert source @ inversion.curvature @ source == pytest.approx(chi2, rel=1e-9)
 
@@ -113,22 +117,22 @@ def seen(request: pytest.FixtureRequest) -> tuple[Simulation, ParametricFit]:
 def test_the_defect_makes_the_image_of_the_fitted_host_exact(seen: tuple[Simulation, ParametricFit]) -> None:
     simulation, fit = seen
     problem = prepare_problem(simulation.observation, fit, Analysis())
-    rays = problem.operator.rays
+    rays = problem.likelihood.rays
     assert rays.envelope is not None
     fluxes = np.append(rays.of_envelope(), 1.0)
     exact = lensed_sersic_image(simulation.observation, rays.envelope.host, fit.lens)[problem.mask]
-    assert np.abs(problem.operator.blurring @ fluxes - exact).max() < 1e-9 * exact.max()
+    assert np.abs(problem.likelihood.blurring @ fluxes - exact).max() < 1e-9 * exact.max()
 
 
 def test_noise_free_data_are_left_well_below_the_noise(seen: tuple[Simulation, ParametricFit]) -> None:
     simulation, noisy_fit = seen
     observation, exposures, lens = simulation.observation, simulation.exposures, simulation.scene.lens
     clean = replace(observation, image=drizzle(exposures.noiseless, exposures.geometry))
-    strength = find_strength(prepare_problem(observation, noisy_fit, Analysis()).operator, lens, MODEL).ln_lambda
+    strength = find_strength(prepare_problem(observation, noisy_fit, Analysis()).likelihood, lens, MODEL).ln_lambda
     problem = prepare_problem(clean, fit_parametric(clean, agn_images=4), Analysis())
-    inversion = invert(problem.operator, lens, strength, MODEL)
-    arc = problem.operator.blurring @ inversion.mapping.apply(inversion.source.ravel())
-    amplitudes = problem.operator.fit_amplitudes(arc)
+    inversion = invert(problem.likelihood, lens, strength, MODEL)
+    arc = problem.likelihood.blurring @ inversion.lensing.apply(inversion.source.ravel())
+    amplitudes = problem.likelihood.fit_amplitudes(arc)
     model = arc + problem.amplitude_images[:, problem.mask].T @ amplitudes
     chosen = ~problem.core[problem.mask]
     residual = ((clean.image[problem.mask] - model) / observation.noise[problem.mask])[chosen]
@@ -138,8 +142,8 @@ def test_noise_free_data_are_left_well_below_the_noise(seen: tuple[Simulation, P
 
 def test_the_evidence_peaks_at_the_true_lens_within_its_own_width(seen: tuple[Simulation, ParametricFit]) -> None:
     simulation, fit = seen
-    operator = prepare_problem(simulation.observation, fit, Analysis()).operator
-    target = Target(operator, wide_prior(fit.lens, shear=False), MODEL)
+    likelihood = prepare_problem(simulation.observation, fit, Analysis()).likelihood
+    target = Target(likelihood, wide_prior(fit.lens, shear=False), MODEL)
     start = target.vector(fit.lens, optimal_strength(target, fit.lens))
     found = find_optimum(target, start, start_covariance(fit.lens_covariance))
     away = (found.mean - target.vector(simulation.scene.lens, 0.0))[:-1]
@@ -150,6 +154,6 @@ def test_the_evidence_peaks_at_the_true_lens_within_its_own_width(seen: tuple[Si
 
 def test_without_an_envelope_nothing_is_added(seen: tuple[Simulation, ParametricFit]) -> None:
     simulation, fit = seen
-    plain = prepare_problem(simulation.observation, fit, Analysis(profile="paper")).operator
+    plain = prepare_problem(simulation.observation, fit, Analysis(profile="paper")).likelihood
     assert plain.rays.envelope is None
     assert plain.blurring.shape[1] == plain.rays.pixels

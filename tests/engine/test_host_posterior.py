@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from benchmarks.biases import paper_runs
 from benchmarks.coverage import drawn_realization
 from engine.conventions import FloatArray, rate_to_magnitude
-from engine.modelling.host_posterior import COORDINATES, HostPosterior
-from engine.modelling.image_model import components
-from engine.modelling.parametric import ParametricFit, fit_parametric
-from engine.refits.image import refit_image
-from engine.scene import Scene
-from engine.simulation import Simulation, simulate_realization
-from engine.spec import ParameterPrior
+from engine.estimators.image import refit_image
+from engine.parametric.fit import ParametricFit, fit_parametric
+from engine.parametric.host_posterior import COORDINATES, HostPosterior
+from engine.parametric.model import components
+from engine.simulation.scene import Scene
+from engine.simulation.simulate import Simulation, simulate_realization
+from engine.spec.priors import ParameterPrior
 
 N = COORDINATES.index("n")
 HELD = 2.02

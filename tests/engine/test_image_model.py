@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from engine.imaging.blurring import place_spline, place_stamp, spline_coefficients
-from engine.imaging.extended import deposit_matrix
 from engine.imaging.observation import Observation
+from engine.imaging.optics.extended import deposit_matrix
+from engine.imaging.optics.spline import place_spline, place_stamp, spline_coefficients
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.modelling.image_model import ImageModel, Layout, components, weights_sigma
+from engine.parametric.model import ImageModel, Layout, components, weights_sigma
 
 SCALE = 0.08
 

@@ -5,7 +5,7 @@ import pytest
 
 from engine import InversionView, Truth, inspect_inversion
 from engine.figures import inversion_figure
-from engine.simulation import Simulation
+from engine.simulation.simulate import Simulation
 from tests.engine.conftest import QUICK
 from tests.engine.true_fit import true_fit
 

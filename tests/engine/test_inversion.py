@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engine.errors import InversionError, ObservationError
-from engine.imaging.blurring import convolve
-from engine.inversion.blurring import central_stamp, pixel_kernel
-from engine.inversion.evidence import Inversion, invert, ln_evidence
-from engine.inversion.mapping import RayBundle, cast_rays, map_rays
-from engine.inversion.operator import LinearData, build_operator
-from engine.inversion.regularisation import SourceModel, ln_determinant, regularisation_matrix
+from engine.imaging.convolution import convolve
+from engine.imaging.optics.stamp_matrix import central_stamp, pixel_kernel
 from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.likelihood.amplitudes import LinearData, marginalise_amplitudes
+from engine.likelihood.evidence import Inversion, invert, ln_evidence
+from engine.source.lensing_matrix import RayBundle, cast_rays, map_rays
+from engine.source.regularisation import SourceModel, ln_determinant, regularisation_matrix
 from tests.engine.dense_oracle import LENS, SCALE, Case
 
 CASES = [
@@ -40,24 +40,24 @@ MODELS = [
 @pytest.mark.parametrize("case", CASES, ids=str)
 def test_evidence_source_and_covariance_equal_the_dense_oracle(case: dict[str, object], model: SourceModel) -> None:
     scene = Case(**case)
-    operator = scene.operator()
+    likelihood = scene.likelihood()
     for ln_lambda in (-3.0, 2.0):
         value, solution, covariance = scene.oracle(LENS, ln_lambda, model)
-        inversion = invert(operator, LENS, ln_lambda, model)
+        inversion = invert(likelihood, LENS, ln_lambda, model)
         n = inversion.source.size
-        assert ln_evidence(operator, LENS, ln_lambda, model) == inversion.ln_evidence
+        assert ln_evidence(likelihood, LENS, ln_lambda, model) == inversion.ln_evidence
         assert inversion.ln_evidence == pytest.approx(value, rel=1e-8, abs=1e-6)
         assert np.allclose(inversion.source.ravel(), solution[:n], rtol=1e-8, atol=1e-8 * np.abs(solution[:n]).max())
         variance = inversion.source_variance().ravel()
         assert np.allclose(variance, np.diag(covariance)[:n], rtol=1e-7)
-        arc = operator.blurring @ inversion.mapping.apply(inversion.source.ravel())
+        arc = likelihood.blurring @ inversion.lensing.apply(inversion.source.ravel())
         if solution.size > n:
-            assert np.allclose(operator.fit_amplitudes(arc), solution[n:], rtol=1e-6, atol=1e-8)
+            assert np.allclose(likelihood.fit_amplitudes(arc), solution[n:], rtol=1e-6, atol=1e-8)
 
 
 def test_the_effective_parameters_are_those_that_the_prior_does_not_decide() -> None:
     scene, model = Case(amplitudes=2), SourceModel((8, 8))
-    inversion = invert(scene.operator(), LENS, 1.0, model)
+    inversion = invert(scene.likelihood(), LENS, 1.0, model)
     _, _, covariance = scene.oracle(LENS, 1.0, model)
     prior_share = math.e * np.trace(covariance[:64, :64] @ regularisation_matrix(model))
     assert inversion.effective_parameters() == pytest.approx(64 - prior_share, rel=1e-8)
@@ -65,7 +65,7 @@ def test_the_effective_parameters_are_those_that_the_prior_does_not_decide() -> 
 
 def test_the_source_draws_have_the_posterior_mean_and_covariance() -> None:
     scene = Case(amplitudes=1)
-    inversion = invert(scene.operator(), LENS, 1.0, SourceModel((6, 6)))
+    inversion = invert(scene.likelihood(), LENS, 1.0, SourceModel((6, 6)))
     rng = np.random.default_rng(3)
     draws = np.array([inversion.draw_source(rng).ravel() for _ in range(4000)])
     sd = np.sqrt(inversion.source_variance().ravel())
@@ -93,10 +93,10 @@ def test_ln_determinant_of_the_regularisation(name: str, shape: tuple[int, int])
 def test_scaling_data_noise_and_source_together_only_shifts_the_evidence(factor: float) -> None:
     scene = Case(amplitudes=2)
     model = SourceModel((8, 8))
-    reference = ln_evidence(scene.operator(), LENS, 0.5, model)
+    reference = ln_evidence(scene.likelihood(), LENS, 0.5, model)
     m, k = scene.data.size, 2
     scene.linear = LinearData(factor * scene.data, factor**2 * scene.covariance, scene.columns)
-    scaled = ln_evidence(scene.operator(), LENS, 0.5 - 2 * math.log(factor), model)
+    scaled = ln_evidence(scene.likelihood(), LENS, 0.5 - 2 * math.log(factor), model)
     assert scaled == pytest.approx(reference - (m - k) * math.log(factor), abs=1e-6)
 
 
@@ -104,32 +104,32 @@ def test_shifting_the_frame_changes_nothing() -> None:
     scene, model = Case(), SourceModel((9, 9))
     rays = scene.rays
     moved = RayBundle(rays.x + 0.37, rays.y - 0.21, rays.subrays, rays.in_mask, rays.pixel_area, rays.anchors)
-    operator = scene.operator()
+    likelihood = scene.likelihood()
     # The shear acts about the origin: without it the whole problem moves rigidly.
     lens = LENS.with_values(gamma1=0.0, gamma2=0.0)
-    shifted = build_operator(scene.linear, operator.blurring, moved)
+    shifted = marginalise_amplitudes(scene.linear, likelihood.blurring, moved)
     there = ln_evidence(shifted, lens.with_values(x=lens.x + 0.37, y=lens.y - 0.21), 0.0, model)
-    assert there == pytest.approx(ln_evidence(operator, lens, 0.0, model), abs=1e-7)
+    assert there == pytest.approx(ln_evidence(likelihood, lens, 0.0, model), abs=1e-7)
 
 
 def test_leaving_out_a_component_equals_having_none() -> None:
     scene, model = Case(amplitudes=0), SourceModel((9, 9))
-    empty = ln_evidence(scene.operator(), LENS, 0.0, model)
+    empty = ln_evidence(scene.likelihood(), LENS, 0.0, model)
     value, _, _ = scene.oracle(LENS, 0.0, model)
     assert empty == pytest.approx(value, rel=1e-10)
     plain = LENS.with_values(gamma1=0.0, gamma2=0.0)
-    without = ln_evidence(scene.operator(), PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01), 0.0, model)
-    assert ln_evidence(scene.operator(), plain, 0.0, model) == without
+    without = ln_evidence(scene.likelihood(), PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01), 0.0, model)
+    assert ln_evidence(scene.likelihood(), plain, 0.0, model) == without
 
 
 def test_strong_and_weak_regularisation_have_finite_evidence_or_a_clear_error() -> None:
     scene, model = Case(amplitudes=1), SourceModel((8, 8))
-    operator = scene.operator()
-    flat = invert(operator, LENS, 40.0, model)
+    likelihood = scene.likelihood()
+    flat = invert(likelihood, LENS, 40.0, model)
     assert np.abs(flat.source).max() < 1e-8
     # More source pixels than data: without regularisation there is no solution.
     with pytest.raises(InversionError, match="lambda"):
-        invert(operator, LENS, -60.0, SourceModel((30, 30)))
+        invert(likelihood, LENS, -60.0, SourceModel((30, 30)))
 
 
 def test_a_mask_of_one_pixel_is_inverted_and_an_empty_one_refused() -> None:
@@ -138,8 +138,8 @@ def test_a_mask_of_one_pixel_is_inverted_and_an_empty_one_refused() -> None:
     mask[6, 6] = True
     rays = cast_rays(mask, np.zeros_like(mask), axis, axis, SCALE, 2)
     linear = LinearData(np.array([1.0]), np.array([0.01]), np.zeros((1, 0)))
-    operator = build_operator(linear, np.ones((1, 1)), rays)
-    assert isinstance(invert(operator, LENS, 0.0, SourceModel((2, 2))), Inversion)
+    likelihood = marginalise_amplitudes(linear, np.ones((1, 1)), rays)
+    assert isinstance(invert(likelihood, LENS, 0.0, SourceModel((2, 2))), Inversion)
     nothing = cast_rays(~mask & mask, mask, axis, axis, SCALE, 2)
     with pytest.raises(InversionError, match="mask"):
         map_rays(nothing, kernel_arguments(LENS), (4, 4))
@@ -149,11 +149,11 @@ def test_noise_that_is_not_positive_and_dependent_amplitudes_are_refused() -> No
     scene = Case(amplitudes=2)
     scene.linear = LinearData(scene.data, np.zeros(scene.data.size), scene.columns)
     with pytest.raises(InversionError, match="noise"):
-        scene.operator()
+        scene.likelihood()
     twice = np.repeat(scene.columns[:, :1], 2, axis=1)
     scene.linear = LinearData(scene.data, scene.covariance, twice)
     with pytest.raises(InversionError, match="amplitudes"):
-        scene.operator()
+        scene.likelihood()
 
 
 def test_rays_of_the_mask_are_inside_the_grid_and_those_far_outside_carry_no_light() -> None:

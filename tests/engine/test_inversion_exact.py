@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import lapack
 
-from engine.inversion.evidence import invert, ln_evidence
-from engine.inversion.mapping import RayBundle
-from engine.inversion.operator import LinearData
-from engine.inversion.regularisation import SourceModel
-from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_operator
+from engine.likelihood.amplitudes import LinearData
+from engine.likelihood.evidence import invert, ln_evidence
+from engine.source.lensing_matrix import RayBundle
+from engine.source.regularisation import SourceModel
+from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_likelihood
 
 SMALL, WIDE, TALL = SourceModel((10, 10)), SourceModel((10, 12)), SourceModel((16, 11), "gradient")
 SET = [
@@ -49,18 +49,18 @@ SET = [
 
 @pytest.mark.parametrize(("scene", "model"), SET, ids=str)
 def test_the_inversion_is_exact(scene: Explicit, model: SourceModel) -> None:
-    operator = scene.operator()
+    likelihood = scene.likelihood()
     largest = model.shape == (60, 60)
     for ln_lambda in (-1.0,) if largest else (-3.0, 1.0):
         expected = scene.solve(ln_lambda, model)
-        found = invert(operator, scene.lens, ln_lambda, model)
+        found = invert(likelihood, scene.lens, ln_lambda, model)
         # 1e-8 of each quantity, of its largest element for vectors and matrices.
         assert found.ln_evidence == pytest.approx(expected.ln_evidence, rel=1e-8)
-        assert ln_evidence(operator, scene.lens, ln_lambda, model) == pytest.approx(expected.ln_evidence, rel=1e-8)
+        assert ln_evidence(likelihood, scene.lens, ln_lambda, model) == pytest.approx(expected.ln_evidence, rel=1e-8)
         assert _difference(found.source.ravel(), expected.source) < 1e-8
-        arc = operator.blurring @ found.mapping.apply(found.source.ravel())
+        arc = likelihood.blurring @ found.lensing.apply(found.source.ravel())
         if expected.amplitudes.size:
-            assert _difference(operator.fit_amplitudes(arc), expected.amplitudes) < 1e-8
+            assert _difference(likelihood.fit_amplitudes(arc), expected.amplitudes) < 1e-8
         n = expected.source.size
         which = np.unique(np.linspace(0, n - 1, 60).astype(int)) if n > 400 else np.arange(n)
         if largest:
@@ -91,7 +91,7 @@ def _covariance(scene: Explicit) -> np.ndarray:
 @PROPERTY
 @given(scene=SCENES, model=MODELS, seed=st.integers(0, 2**20))
 def test_the_order_of_the_pixels_does_not_matter(scene: Explicit, model: SourceModel, seed: int) -> None:
-    operator, linear, rays = scene.operator(), scene.linear, scene.operator().rays
+    likelihood, linear, rays = scene.likelihood(), scene.linear, scene.likelihood().rays
     rng = np.random.default_rng(seed)
     data, light = rng.permutation(linear.data.size), rng.permutation(rays.pixels)
     per_pixel = rays.subrays**2
@@ -103,14 +103,14 @@ def test_the_order_of_the_pixels_does_not_matter(scene: Explicit, model: SourceM
         rays.pixel_area,
         rays.anchors,
     )
-    other = stamp_operator(
+    other = stamp_likelihood(
         LinearData(linear.data[data], _covariance(scene)[np.ix_(data, data)], linear.columns[data]),
         stamp(scene.psf),
         moved,
         tuple(axis[data] for axis in np.nonzero(scene.chosen)),  # type: ignore[arg-type]
         tuple(axis[light] for axis in np.nonzero(scene.rayed)),  # type: ignore[arg-type]
     )
-    expected = ln_evidence(operator, LENS, 0.0, model)
+    expected = ln_evidence(likelihood, LENS, 0.0, model)
     assert ln_evidence(other, LENS, 0.0, model) == pytest.approx(expected, rel=1e-9)
 
 
@@ -119,13 +119,13 @@ def test_the_order_of_the_pixels_does_not_matter(scene: Explicit, model: SourceM
 def test_other_units_of_flux_only_shift_the_evidence(scene: Explicit, model: SourceModel, ln_factor: float) -> None:
     linear, factor = scene.linear, math.exp(ln_factor)
     pixels = np.nonzero(scene.chosen), np.nonzero(scene.rayed)
-    operator = scene.operator()
+    likelihood = scene.likelihood()
     scaled = LinearData(factor * linear.data, factor**2 * linear.covariance, linear.columns)
-    other = stamp_operator(scaled, stamp(scene.psf), operator.rays, *pixels)
-    here = invert(operator, LENS, 0.3, model)
+    other = stamp_likelihood(scaled, stamp(scene.psf), likelihood.rays, *pixels)
+    here = invert(likelihood, LENS, 0.3, model)
     there = invert(other, LENS, 0.3 - 2 * ln_factor, model)
     # The flat prior of the amplitudes has units too: k of the M factors are theirs.
-    shift = (operator.data_points - operator.amplitudes) * ln_factor
+    shift = (likelihood.data_points - likelihood.amplitudes) * ln_factor
     assert there.ln_evidence == pytest.approx(here.ln_evidence - shift, abs=1e-7 * (1 + abs(shift)))
     assert _difference(there.source / factor, here.source) < 1e-9
 
@@ -141,15 +141,15 @@ def test_other_units_of_flux_only_shift_the_evidence(scene: Explicit, model: Sou
 def test_shifting_the_frame_shifts_the_source_grid_alone(
     scene: Explicit, model: SourceModel, dx: float, dy: float, sheared: bool
 ) -> None:
-    operator = scene.operator()
+    likelihood = scene.likelihood()
     lens = LENS if sheared else LENS.with_values(gamma1=0.0, gamma2=0.0)
-    rays = operator.rays
+    rays = likelihood.rays
     moved = RayBundle(
         rays.x + dx, rays.y + dy, rays.subrays, rays.in_mask, rays.pixel_area, rays.anchors + np.array([dx, dy])
     )
     pixels = np.nonzero(scene.chosen), np.nonzero(scene.rayed)
-    other = stamp_operator(scene.linear, stamp(scene.psf), moved, *pixels)
-    here = invert(operator, lens, 0.0, model)
+    other = stamp_likelihood(scene.linear, stamp(scene.psf), moved, *pixels)
+    here = invert(likelihood, lens, 0.0, model)
     there = invert(other, lens.with_values(x=lens.x + dx, y=lens.y + dy), 0.0, model)
     # Shear is about the origin of the frame: a shifted frame shifts the source by (1 - Gamma) of it.
     shift = (dx - lens.gamma1 * dx - lens.gamma2 * dy, dy - lens.gamma2 * dx + lens.gamma1 * dy)
@@ -162,7 +162,7 @@ def test_shifting_the_frame_shifts_the_source_grid_alone(
 @given(model=MODELS, pixel=st.integers(0, 10**6), apart=st.floats(-3.0, 3.0))
 def test_a_pixel_measured_twice_with_root_two_noise_says_the_same(model: SourceModel, pixel: int, apart: float) -> None:
     scene = Explicit()
-    linear, operator = scene.linear, scene.operator()
+    linear, likelihood = scene.linear, scene.likelihood()
     at = pixel % linear.data.size
     sigma = math.sqrt(linear.covariance[at])
     twice = np.append(np.arange(linear.data.size), at)
@@ -170,14 +170,14 @@ def test_a_pixel_measured_twice_with_root_two_noise_says_the_same(model: SourceM
     data[[at, -1]] += apart * sigma * np.array([1.0, -1.0])
     variance[[at, -1]] *= 2.0
     rows, columns = np.nonzero(scene.chosen)
-    other = stamp_operator(
+    other = stamp_likelihood(
         LinearData(data, variance, linear.columns[twice]),
         stamp(scene.psf),
-        operator.rays,
+        likelihood.rays,
         (rows[twice], columns[twice]),
         np.nonzero(scene.rayed),
     )
-    here, there = invert(operator, LENS, 0.0, model), invert(other, LENS, 0.0, model)
+    here, there = invert(likelihood, LENS, 0.0, model), invert(other, LENS, 0.0, model)
     assert _difference(there.source, here.source) < 1e-9
     # The two measurements differ by 2 apart sigma with a deviation of 2 sigma: one Gaussian more in the evidence.
     extra = -0.5 * apart**2 - math.log(2.0 * sigma) - 0.5 * math.log(2.0 * math.pi)

@@ -8,26 +8,26 @@ import pytest
 
 from engine.errors import InversionError, ObservationError, SpecError
 from engine.imaging.observation import Observation
-from engine.inversion.evidence import MAX_CONDITION, invert, ln_evidence
-from engine.inversion.operator import LinearData, Operator
-from engine.inversion.problem import prepare_problem
-from engine.inversion.regularisation import SourceModel, regularisation_matrix
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.scene import Scene
-from engine.simulation import Simulation
-from engine.spec import Analysis
-from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_operator
+from engine.likelihood.amplitudes import LinearData, MarginalLikelihood
+from engine.likelihood.evidence import MAX_CONDITION, invert, ln_evidence
+from engine.likelihood.problem import prepare_problem
+from engine.simulation.scene import Scene
+from engine.simulation.simulate import Simulation
+from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.spec.analysis import Analysis
+from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_likelihood
 from tests.engine.true_fit import bare_fit, true_fit
 
 MODEL = SourceModel((11, 12))
 
 
-def rebuilt(scene: Explicit, linear: LinearData | None = None, psf: np.ndarray | None = None) -> Operator:
-    return stamp_operator(
+def rebuilt(scene: Explicit, linear: LinearData | None = None, psf: np.ndarray | None = None) -> MarginalLikelihood:
+    return stamp_likelihood(
         scene.linear if linear is None else linear,
         stamp(scene.psf) if psf is None else psf,
-        scene.operator().rays,
+        scene.likelihood().rays,
         np.nonzero(scene.chosen),
         np.nonzero(scene.rayed),
     )
@@ -38,10 +38,10 @@ def rebuilt(scene: Explicit, linear: LinearData | None = None, psf: np.ndarray |
 
 @pytest.mark.parametrize(("name", "value"), [("slope", 2.0), ("q", 1.0)])
 def test_the_evidence_is_continuous_where_formulas_change(name: str, value: float) -> None:
-    operator, lens = Explicit().operator(), LENS.with_values(**{name: value})
-    here = ln_evidence(operator, lens, 0.0, MODEL)
+    likelihood, lens = Explicit().likelihood(), LENS.with_values(**{name: value})
+    here = ln_evidence(likelihood, lens, 0.0, MODEL)
     for step in (-1e-12, 1e-12) if name == "slope" else (-1e-12,):
-        there = ln_evidence(operator, lens.with_values(**{name: value + step}), 0.0, MODEL)
+        there = ln_evidence(likelihood, lens.with_values(**{name: value + step}), 0.0, MODEL)
         # ln Z of several hundred changes by less than 1e4 for a change of one in the parameter.
         assert there == pytest.approx(here, abs=1e-7)
 
@@ -50,14 +50,14 @@ def test_the_evidence_is_continuous_where_formulas_change(name: str, value: floa
 def test_extreme_lenses_are_inverted_exactly(lens: PowerLawLens) -> None:
     scene = Explicit(lens=lens)
     expected = scene.solve(0.0, MODEL)
-    found = invert(scene.operator(), lens, 0.0, MODEL)
+    found = invert(scene.likelihood(), lens, 0.0, MODEL)
     assert found.ln_evidence == pytest.approx(expected.ln_evidence, rel=1e-8)
     assert np.allclose(found.source.ravel(), expected.source, atol=1e-8 * np.abs(expected.source).max())
 
 
 def test_a_round_lens_does_not_know_its_angle() -> None:
-    operator, round_ = Explicit().operator(), LENS.with_values(q=1.0)
-    values = [ln_evidence(operator, round_.with_values(phi=phi), 0.0, MODEL) for phi in (0.0, 0.7, 2.1)]
+    likelihood, round_ = Explicit().likelihood(), LENS.with_values(q=1.0)
+    values = [ln_evidence(likelihood, round_.with_values(phi=phi), 0.0, MODEL) for phi in (0.0, 0.7, 2.1)]
     assert values == pytest.approx([values[0]] * 3, rel=1e-11)
 
 
@@ -66,16 +66,16 @@ def test_a_ray_through_the_centre_of_the_lens_is_traced(slope: float) -> None:
     # The middle ray of 3 x 3 of the central pixel hits the centre exactly.
     lens = PowerLawLens(0.8, 0.8, 0.4, slope)
     scene = Explicit(mask="disc", subrays=3, lens=lens)
-    assert ln_evidence(scene.operator(), lens, 0.0, MODEL) == pytest.approx(
+    assert ln_evidence(scene.likelihood(), lens, 0.0, MODEL) == pytest.approx(
         scene.solve(0.0, MODEL).ln_evidence, rel=1e-8
     )
 
 
 def test_no_shear_is_shear_of_zero() -> None:
-    operator = Explicit().operator()
+    likelihood = Explicit().likelihood()
     without = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01)
     with_zero = LENS.with_values(gamma1=0.0, gamma2=0.0)
-    assert ln_evidence(operator, without, 0.0, MODEL) == ln_evidence(operator, with_zero, 0.0, MODEL)
+    assert ln_evidence(likelihood, without, 0.0, MODEL) == ln_evidence(likelihood, with_zero, 0.0, MODEL)
 
 
 def test_a_lens_outside_the_formulas_is_refused() -> None:
@@ -103,20 +103,20 @@ def test_a_component_that_is_left_out_changes_nothing_where_its_flux_is_known_to
     rows, cols = np.nonzero(scene.chosen)
     held = np.zeros((extra, k))
     held[np.arange(extra), k - extra + np.arange(extra)] = 1.0
-    operator = stamp_operator(
+    likelihood = stamp_likelihood(
         LinearData(
             np.concatenate([data, np.zeros(extra)]),
             np.concatenate([scene.linear.covariance, np.full(extra, sigma**2)]),
             np.vstack([full.linear.columns, held]),
         ),
         stamp(scene.psf),
-        scene.operator().rays,
+        scene.likelihood().rays,
         (np.concatenate([rows, far]), np.concatenate([cols, far])),
         np.nonzero(scene.rayed),
     )
     # The flat prior of each amplitude integrates its measurement to one.
-    assert ln_evidence(operator, LENS, 0.0, MODEL) == pytest.approx(
-        ln_evidence(scene.operator(), LENS, 0.0, MODEL), rel=1e-8
+    assert ln_evidence(likelihood, LENS, 0.0, MODEL) == pytest.approx(
+        ln_evidence(scene.likelihood(), LENS, 0.0, MODEL), rel=1e-8
     )
 
 
@@ -144,7 +144,7 @@ def test_a_scene_without_agn_or_deflector_has_no_columns_of_them(scene: Scene, s
     )
     assert bare.amplitude_names == ("background",)
     assert not bare.core.any()
-    assert bare.operator.amplitudes == 1
+    assert bare.likelihood.amplitudes == 1
     full = prepare_problem(simulation.observation, fit, Analysis(noise_treatment="diagonal"))
     assert full.amplitude_names == ("agn1", "agn2", "agn3", "agn4", "deflector", "background")
 
@@ -156,7 +156,7 @@ def test_a_source_grid_of_two_by_two_is_inverted_exactly() -> None:
     for name in ("zeroth", "gradient", "curvature"):
         scene, model = Explicit(), SourceModel((2, 2), name)  # type: ignore[arg-type]
         expected = scene.solve(0.0, model)
-        assert invert(scene.operator(), LENS, 0.0, model).ln_evidence == pytest.approx(expected.ln_evidence, rel=1e-8)
+        assert invert(scene.likelihood(), LENS, 0.0, model).ln_evidence == pytest.approx(expected.ln_evidence, rel=1e-8)
 
 
 def test_a_mask_without_valid_pixels_is_refused(scene: Scene, simulation: Simulation) -> None:
@@ -180,10 +180,10 @@ def test_a_saturated_pixel_is_not_used_whatever_its_value(scene: Scene, simulati
             replace(observation, image=image, noise=noise, valid=valid), fit, Analysis(noise_treatment="diagonal")
         )
         assert not problem.mask[row, column]
-        values.append(ln_evidence(problem.operator, fit.lens, -9.0, SourceModel((12, 12))))
+        values.append(ln_evidence(problem.likelihood, fit.lens, -9.0, SourceModel((12, 12))))
     assert values[0] == values[1] == values[2]
     whole = prepare_problem(observation, fit, Analysis(noise_treatment="diagonal"))
-    assert problem.operator.data_points == whole.operator.data_points - 1
+    assert problem.likelihood.data_points == whole.likelihood.data_points - 1
 
 
 # Noise
@@ -225,10 +225,10 @@ def test_a_psf_that_is_not_centred_moves_the_image() -> None:
     off = np.roll(larger, (1, 2), axis=(0, 1))
     rows, columns = np.nonzero(scene.chosen)
     pixels = np.nonzero(scene.rayed)
-    rays = scene.operator().rays
-    here = stamp_operator(scene.linear, larger, rays, (rows, columns), pixels)
+    rays = scene.likelihood().rays
+    here = stamp_likelihood(scene.linear, larger, rays, (rows, columns), pixels)
     # Light that arrives one row up and two columns on is the same light, seen there.
-    there = stamp_operator(scene.linear, off, rays, (rows + 1, columns + 2), pixels)
+    there = stamp_likelihood(scene.linear, off, rays, (rows + 1, columns + 2), pixels)
     assert ln_evidence(there, LENS, 0.0, MODEL) == pytest.approx(ln_evidence(here, LENS, 0.0, MODEL), rel=1e-12)
 
 
@@ -250,7 +250,7 @@ def test_a_problem_is_laid_out_with_a_psf_larger_than_the_image() -> None:
     problem = prepare_problem(
         observation, fit, Analysis(psf_radius=80, source_pixels=(8, 8), noise_treatment="diagonal")
     )
-    assert math.isfinite(ln_evidence(problem.operator, LENS, 0.0, SourceModel((8, 8))))
+    assert math.isfinite(ln_evidence(problem.likelihood, LENS, 0.0, SourceModel((8, 8))))
 
 
 # Trust
@@ -260,7 +260,7 @@ def test_a_problem_is_laid_out_with_a_psf_larger_than_the_image() -> None:
 @pytest.mark.parametrize("name", ["zeroth", "gradient", "curvature"])
 def test_the_condition_number_is_the_true_one_within_a_factor_of_three(name: str, ln_lambda: float) -> None:
     model = SourceModel((12, 13), name)  # type: ignore[arg-type]
-    inversion = invert(Explicit().operator(), LENS, ln_lambda, model)
+    inversion = invert(Explicit().likelihood(), LENS, ln_lambda, model)
     a = inversion.curvature + math.exp(ln_lambda) * regularisation_matrix(model)
     true = np.linalg.norm(a, 1) * np.linalg.norm(np.linalg.inv(a), 1)
     # LAPACK's estimate of the norm of the inverse is a lower bound, seldom below a third.
@@ -270,12 +270,12 @@ def test_the_condition_number_is_the_true_one_within_a_factor_of_three(name: str
 
 
 def test_where_the_solve_cannot_be_trusted_an_error_says_what_to_change() -> None:
-    operator, model = Explicit().operator(), SourceModel((30, 30))
+    likelihood, model = Explicit().likelihood(), SourceModel((30, 30))
     # More source pixels than data: the smaller lambda, the worse, until A is not even positive definite.
     accepted, refused = [], []
     for ln_lambda in np.arange(-80.0, 0.0, 2.0):
         try:
-            accepted.append(invert(operator, LENS, float(ln_lambda), model).condition_number)
+            accepted.append(invert(likelihood, LENS, float(ln_lambda), model).condition_number)
         except InversionError as error:
             refused.append(str(error))
     assert len(refused) > 10
@@ -289,10 +289,10 @@ def test_where_the_solve_cannot_be_trusted_an_error_says_what_to_change() -> Non
 def test_the_evidence_refuses_what_it_knows_to_be_rounding(ln_lambda: float) -> None:
     # Here rounding often leaves A positive definite, with numbers that mean nothing.
     with pytest.raises(InversionError, match="larger lambda"):
-        ln_evidence(Explicit().operator(), LENS, ln_lambda, SourceModel((12, 12)))
+        ln_evidence(Explicit().likelihood(), LENS, ln_lambda, SourceModel((12, 12)))
 
 
 @pytest.mark.parametrize("ln_lambda", [-800.0, 800.0, math.nan])
 def test_a_strength_beyond_the_numbers_is_refused(ln_lambda: float) -> None:
     with pytest.raises(InversionError, match="lambda"):
-        ln_evidence(Explicit().operator(), LENS, ln_lambda, SourceModel((30, 30)))
+        ln_evidence(Explicit().likelihood(), LENS, ln_lambda, SourceModel((30, 30)))

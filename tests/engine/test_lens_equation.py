@@ -10,7 +10,7 @@ from engine.catalogue import load_system, system_facts, system_names
 from engine.conventions import sky_to_image
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens, magnification, source_position
-from engine.scene import power_law_lens
+from engine.simulation.scene import power_law_lens
 from tests.engine.angular_solver import AngularSolver
 
 

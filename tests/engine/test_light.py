@@ -16,8 +16,9 @@ from engine.light.radial_table import brightness, tabulate, to_profile_axes
 from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_lensed_sersic
 from engine.light.sersic import SersicProfile, mean_surface_brightness, sersic_k, surface_brightness
 from engine.light.sersic import kernel_arguments as sersic_arguments
-from engine.scene import build_scene
-from engine.spec import Host, Realization
+from engine.simulation.scene import build_scene
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 from tests.engine.light_oracle import flux_through_the_sides, graded_fluxes, supersampled
 
 HE0435 = PowerLawLens(1.2171, 0.85, 1.29, 2.0)

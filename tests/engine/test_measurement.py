@@ -21,14 +21,14 @@ from engine import (
     SpecError,
     load_system,
     measure_image,
-    read_foreign_observation,
+    read_external_observation,
     simulate_realization,
 )
 from engine.figures import measurement_figure
 from engine.imaging.observation import Observation
 from engine.measurement_files import write_measurement
-from engine.modelling.parametric import fit_parametric
-from engine.simulation import Simulation
+from engine.parametric.fit import fit_parametric
+from engine.simulation.simulate import Simulation
 
 SHARED_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
@@ -153,7 +153,7 @@ def _paired_lens(kind: str) -> tuple[Observation, dict[str, float]]:
     folder = SHARED_DATA / "paired_lens" / f"sim_lens_{kind}"
     if not folder.is_dir():
         pytest.skip("the foreign example data (shared/data beside the project) are not here")
-    seen = read_foreign_observation(
+    seen = read_external_observation(
         folder / "Drz_QSO_image.fits", folder / "Drz_PSF.fits", zero_point=25.9463, noise=folder / "noise_map.fits",
         pixel_scale=0.08, recentre_psf="pixel", normalise_psf=True,
     )  # fmt: skip

@@ -10,22 +10,22 @@ from scipy.linalg import solve_triangular
 from engine.errors import ObservationError
 from engine.imaging.drizzling import drizzle_weights
 from engine.imaging.noise import draw_noise
-from engine.inversion.evidence import invert
-from engine.inversion.operator import Operator
-from engine.inversion.problem import Problem, prepare_problem
-from engine.inversion.regularisation import SourceModel
-from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens
-from engine.scene import Scene
-from engine.simulation import Simulation
-from engine.spec import Analysis
+from engine.likelihood.amplitudes import MarginalLikelihood
+from engine.likelihood.evidence import invert
+from engine.likelihood.problem import Problem, prepare_problem
+from engine.likelihood.strength import find_strength
+from engine.simulation.scene import Scene
+from engine.simulation.simulate import Simulation
+from engine.source.regularisation import SourceModel
+from engine.spec.analysis import Analysis
 from tests.engine.true_fit import true_fit
 
 TREATMENTS = ("diagonal", "covariance", "paper_code")
 
 
 def whiten(problem: Problem, values: np.ndarray) -> np.ndarray:
-    factor = problem.operator.whitened.covariance
+    factor = problem.likelihood.whitened.covariance
     if factor.ndim == 1:
         return values / (factor if values.ndim == 1 else factor[:, None])
     return solve_triangular(factor, values, lower=True)
@@ -60,7 +60,7 @@ def test_noise_alone_has_the_chi2_and_the_scatter_of_its_covariance_only(observe
     mask = np.flatnonzero(observed.problems["diagonal"].mask)[chosen]
     covariance = observed.simulation.observation.covariance[mask][:, mask].toarray()
     factor, sigma, m = np.linalg.cholesky(covariance), np.sqrt(np.diag(covariance)), mask.size
-    paper = observed.problems["paper_code"].operator.whitened.covariance[chosen]
+    paper = observed.problems["paper_code"].likelihood.whitened.covariance[chosen]
     white, diagonal, coded = [], [], []
     for _ in range(300):
         noise = observed.noise(rng)[chosen]
@@ -84,29 +84,29 @@ def test_an_inversion_of_drizzled_noise_has_chi2_one_with_the_covariance_and_not
 ) -> None:
     model, rng = SourceModel((16, 16)), np.random.default_rng(4)
     names = ("diagonal", "covariance")
-    first = observed.problems["diagonal"].operator
+    first = observed.problems["diagonal"].likelihood
     strength = find_strength(first, observed.lens, model).ln_lambda
     truth = invert(first, observed.lens, strength, model)
     # Data that the model can describe: whatever chi^2 differs from one by is the noise model's.
-    arc = first.blurring @ truth.mapping.apply(truth.source.ravel())
+    arc = first.blurring @ truth.lensing.apply(truth.source.ravel())
     parts = {}
     for name in names:
         problem = observed.problems[name]
-        basis, _ = np.linalg.qr(problem.operator.whitened.columns)
-        parts[name] = basis, whiten(problem, problem.operator.blurring.toarray())
+        basis, _ = np.linalg.qr(problem.likelihood.whitened.columns)
+        parts[name] = basis, whiten(problem, problem.likelihood.blurring.toarray())
     chi2: dict[str, list[float]] = {name: [] for name in names}
     source_error: dict[str, list[float]] = {name: [] for name in names}
     for _ in range(24):
         data = arc + observed.noise(rng)
         for name in names:
             problem = observed.problems[name]
-            operator = _with_data(problem, data, *parts[name])
-            found = find_strength(operator, observed.lens, model)
-            inversion = invert(operator, observed.lens, found.ln_lambda, model)
-            fitted = operator.blurring @ inversion.mapping.apply(inversion.source.ravel())
+            likelihood = _with_data(problem, data, *parts[name])
+            found = find_strength(likelihood, observed.lens, model)
+            inversion = invert(likelihood, observed.lens, found.ln_lambda, model)
+            fitted = likelihood.blurring @ inversion.lensing.apply(inversion.source.ravel())
             gamma = inversion.effective_parameters()
-            freedom = int((problem.mask & ~problem.core).sum()) - operator.amplitudes - gamma
-            chi2[name].append(operator.chi2(fitted, operator.fit_amplitudes(fitted)) / freedom)
+            freedom = int((problem.mask & ~problem.core).sum()) - likelihood.amplitudes - gamma
+            chi2[name].append(likelihood.chi2(fitted, likelihood.fit_amplitudes(fitted)) / freedom)
             off = (inversion.source - truth.source).ravel()
             source_error[name].append(float(off @ inversion.curvature @ off) / gamma)
     # One realization scatters by 0.04; 24 know the mean to 0.009.
@@ -118,14 +118,14 @@ def test_an_inversion_of_drizzled_noise_has_chi2_one_with_the_covariance_and_not
     assert np.mean(source_error["diagonal"]) > 1.4
 
 
-def _with_data(problem: Problem, data: np.ndarray, basis: np.ndarray, white_blurring: np.ndarray) -> Operator:
+def _with_data(problem: Problem, data: np.ndarray, basis: np.ndarray, white_blurring: np.ndarray) -> MarginalLikelihood:
     white = whiten(problem, data)
     projected = white - basis @ (basis.T @ white)
     return replace(
-        problem.operator,
+        problem.likelihood,
         wd=white_blurring.T @ projected,
         dd=float(projected @ projected),
-        whitened=replace(problem.operator.whitened, data=white),
+        whitened=replace(problem.likelihood.whitened, data=white),
     )
 
 
@@ -134,7 +134,7 @@ def test_the_treatments_differ_as_they_are_described(observed: Observed) -> None
     problem = observed.problems["diagonal"]
     chosen = ~problem.core[problem.mask]
     sigma = observation.noise[problem.mask]
-    stored = {name: observed.problems[name].operator.whitened.covariance for name in TREATMENTS}
+    stored = {name: observed.problems[name].likelihood.whitened.covariance for name in TREATMENTS}
     assert np.allclose(stored["diagonal"][chosen], sigma[chosen], rtol=1e-14)
     assert (stored["diagonal"][~chosen] > 999 * sigma[~chosen]).all()
     expected = np.sqrt(sigma**2 + 0.01 * np.abs(observation.image[problem.mask]))

@@ -17,15 +17,17 @@ import pytest
 
 from engine.catalogue import load_system
 from engine.conventions import rate_to_magnitude
-from engine.inversion.problem import prepare_problem
+from engine.estimators.draws import DrawSet, source_draw
+from engine.estimators.refit import refit_draws
 from engine.lensing.power_law import PowerLawLens
-from engine.modelling.parametric import ParametricFit, fit_parametric
+from engine.likelihood.problem import prepare_problem
+from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
-from engine.refits.draws import DrawSet, source_draw
-from engine.refits.estimators import refit_draws
 from engine.run import prepare_target
-from engine.simulation import Simulation, simulate_realization
-from engine.spec import Analysis, Host, Realization
+from engine.simulation.simulate import Simulation, simulate_realization
+from engine.spec.analysis import Analysis
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 
 SAME = 0.05
 """Magnitudes."""
@@ -50,7 +52,7 @@ def find(simulation: Simulation, fit: ParametricFit, analysis: Analysis, lens: P
     refits = refit_draws(DrawSet((draw,), fit.hosts), ("paper",), None, rng)
     profile = next(refit for refit in refits if refit.index_prior == "free").fits[0]
     assert profile is not None
-    arc = problem.operator.blurring @ inversion.mapping.apply(inversion.source.ravel())
+    arc = problem.likelihood.blurring @ inversion.lensing.apply(inversion.source.ravel())
     zero = simulation.observation.zero_point
     return Found(rate_to_magnitude(profile.profile.flux, zero), rate_to_magnitude(float(arc.sum()), zero))
 

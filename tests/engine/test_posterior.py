@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
-from engine.inversion.regularisation import SourceModel
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
 from engine.posterior.proposal import StudentProposal
 from engine.posterior.surrogate import Surrogate, learn_surrogate
 from engine.posterior.target import Prior, Recorded, Target, wide_prior
+from engine.source.regularisation import SourceModel
 from tests.engine.dense_oracle import LENS, Case
 
 
@@ -233,23 +233,23 @@ def test_a_walker_that_is_stuck_lengthens_the_autocorrelation_time() -> None:
 
 
 def test_the_strength_that_maximises_the_evidence_is_found() -> None:
-    operator = Case(amplitudes=1).operator()
-    target = Target(operator, wide_prior(LENS, shear=True), SourceModel((9, 9)))
+    likelihood = Case(amplitudes=1).likelihood()
+    target = Target(likelihood, wide_prior(LENS, shear=True), SourceModel((9, 9)))
     best = optimal_strength(target, LENS)
     values = [target(target.vector(LENS, best + step)) for step in (-0.3, 0.0, 0.3)]
     assert values[1] > max(values[0], values[2])
 
 
 def test_a_strength_without_a_maximum_is_refused() -> None:
-    operator = Case(amplitudes=1).operator()
-    target = Target(operator, wide_prior(LENS, shear=True), SourceModel((9, 9)))
+    likelihood = Case(amplitudes=1).likelihood()
+    target = Target(likelihood, wide_prior(LENS, shear=True), SourceModel((9, 9)))
     best = optimal_strength(target, LENS)
     with pytest.raises(PosteriorError, match="ln lambda"):
         optimal_strength(target, LENS, low=best + 3.0, high=best + 9.0)
 
 
 def test_outside_the_prior_nothing_is_evaluated() -> None:
-    target = Target(Case().operator(), wide_prior(LENS, shear=True), SourceModel((6, 6)))
+    target = Target(Case().likelihood(), wide_prior(LENS, shear=True), SourceModel((6, 6)))
     outside = target.vector(LENS, 0.0)
     outside[1] = 1.2
     assert target(outside) == -math.inf
@@ -262,5 +262,5 @@ def test_a_lens_without_shear_has_no_shear_parameters() -> None:
     plain = LENS.with_values(gamma1=0.0, gamma2=0.0)
     prior = wide_prior(plain, shear=False)
     assert prior.names == ("theta_E", "q", "phi", "slope", "x", "y", "ln_lambda")
-    target = Target(Case().operator(), prior, SourceModel((6, 6)))
+    target = Target(Case().likelihood(), prior, SourceModel((6, 6)))
     assert target.lens(target.vector(plain, 0.0)) == plain

@@ -10,14 +10,15 @@ import pytest
 
 from engine import Analysis, Host, Realization, SpecError, check_analysis, load_system, measure, simulate_realization
 from engine.catalogue import system_names
-from engine.inversion.evidence import ln_evidence
-from engine.inversion.regularisation import SourceModel
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
+from engine.likelihood.evidence import ln_evidence
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.target import Target, wide_prior
 from engine.run import Truth, analysis_of
-from engine.spec import ParameterPrior, realization_from_dict
+from engine.source.regularisation import SourceModel
+from engine.spec.priors import ParameterPrior
+from engine.spec.realization import realization_from_dict
 from tests.engine.dense_oracle import Case
 
 LENS = PowerLawLens(1.2, 0.75, 0.6, 2.05, 0.01, -0.02, 0.0, 0.0)
@@ -61,13 +62,13 @@ def test_positions_prefer_the_lens_that_made_them() -> None:
 
 
 def test_the_target_is_evidence_prior_and_positions() -> None:
-    operator, source = Case(amplitudes=1).operator(), SourceModel((9, 9))
+    likelihood, source = Case(amplitudes=1).likelihood(), SourceModel((9, 9))
     prior = wide_prior(LENS, shear=False).restricted({"slope": ParameterPrior(mean=2.0, sd=0.1)})
     positions = AgnPositions(np.array([[1.0, 0.3], [-0.9, -0.2]]), 0.01)
-    values = Target(operator, prior, source).vector(LENS, 0.5)
-    bare = ln_evidence(operator, LENS, 0.5, source)
-    assert Target(operator, prior, source)(values) == pytest.approx(bare - 0.5 * (0.05 / 0.1) ** 2)
-    both = Target(operator, prior, source, positions)(values)
+    values = Target(likelihood, prior, source).vector(LENS, 0.5)
+    bare = ln_evidence(likelihood, LENS, 0.5, source)
+    assert Target(likelihood, prior, source)(values) == pytest.approx(bare - 0.5 * (0.05 / 0.1) ** 2)
+    both = Target(likelihood, prior, source, positions)(values)
     assert both == pytest.approx(bare - 0.125 + positions.ln_likelihood(LENS))
 
 

@@ -22,7 +22,7 @@ from engine import (
 )
 from engine.figures import run_figure
 from engine.result import ESTIMATORS, INDEX_PRIORS
-from engine.simulation import Simulation, simulate_realization
+from engine.simulation.simulate import Simulation, simulate_realization
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +114,7 @@ def test_an_observation_without_a_truth_has_no_bias(simulation: Simulation, real
 
 def test_the_truth_changes_nothing_but_the_biases(simulation: Simulation, realization: Realization) -> None:
     from engine.run import Truth
-    from engine.scene import build_scene
+    from engine.simulation.scene import build_scene
 
     scene = build_scene(realization)
     blind = measure(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)

@@ -7,8 +7,8 @@ import pytest
 
 from engine.imaging.drizzling import drizzle
 from engine.imaging.noise import draw_noise
-from engine.scene import build_scene
-from engine.simulation import (
+from engine.simulation.scene import build_scene
+from engine.simulation.simulate import (
     blurred_host,
     combine,
     high_resolution_host,
@@ -17,7 +17,9 @@ from engine.simulation import (
     simulate,
     simulate_exposures,
 )
-from engine.spec import Host, Optics, Realization
+from engine.spec.instrument import Optics
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 
 SPEC = Realization(system="HE0435", l_eta=1.0, host=Host(n=4.0, r_eff=0.39, magnitude=20.5))
 DRAWS = 200

@@ -11,8 +11,8 @@ from engine import Grid, Host, Realization, expand, simulate_realization, system
 from engine.catalogue import load_camera
 from engine.figures import gallery_figure, montage_figure, simulation_figure
 from engine.figures.sky import stretch, stretch_ticks
-from engine.seeds import generator
-from engine.simulation import Simulation
+from engine.simulation.seeds import generator
+from engine.simulation.simulate import Simulation
 
 LEVELS = ("author", "handbook")
 

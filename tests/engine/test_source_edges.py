@@ -7,16 +7,16 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from engine.inversion.evidence import ln_evidence
-from engine.inversion.mapping import RayBundle
-from engine.inversion.operator import Operator
-from engine.inversion.problem import prepare_problem
-from engine.inversion.regularisation import SourceModel
-from engine.inversion.strength import find_strength
 from engine.lensing.power_law import PowerLawLens, source_position
-from engine.scene import Scene
-from engine.simulation import Simulation
-from engine.spec import Analysis
+from engine.likelihood.amplitudes import MarginalLikelihood
+from engine.likelihood.evidence import ln_evidence
+from engine.likelihood.problem import prepare_problem
+from engine.likelihood.strength import find_strength
+from engine.simulation.scene import Scene
+from engine.simulation.simulate import Simulation
+from engine.source.lensing_matrix import RayBundle
+from engine.source.regularisation import SourceModel
+from engine.spec.analysis import Analysis
 from tests.engine.true_fit import true_fit
 
 # A few standard deviations of the posterior of each parameter, where the extreme ray or a crossing is sure to change.
@@ -26,14 +26,14 @@ Signature = Callable[[PowerLawLens], bytes]
 
 @dataclass(frozen=True)
 class Fitted:
-    operator: Operator
+    likelihood: MarginalLikelihood
     lens: PowerLawLens
 
 
 @pytest.fixture(scope="module")
 def fitted(scene: Scene, simulation: Simulation) -> Fitted:
     return Fitted(
-        prepare_problem(simulation.observation, true_fit(scene), Analysis(noise_treatment="diagonal")).operator,
+        prepare_problem(simulation.observation, true_fit(scene), Analysis(noise_treatment="diagonal")).likelihood,
         scene.lens,
     )
 
@@ -79,12 +79,12 @@ def changes(rays: RayBundle, lens: PowerLawLens, name: str, signature: Callable)
 @pytest.mark.parametrize("signature", [extremes, outside])
 def test_the_evidence_does_not_jump(fitted: Fitted, signature: Callable) -> None:
     model = SourceModel((20, 20))
-    strength = find_strength(fitted.operator, fitted.lens, model).ln_lambda
+    strength = find_strength(fitted.likelihood, fitted.lens, model).ln_lambda
     jumps = []
     for name in RANGES:
-        for pair in changes(fitted.operator.rays, fitted.lens, name, signature):
+        for pair in changes(fitted.likelihood.rays, fitted.lens, name, signature):
             low, high = (
-                ln_evidence(fitted.operator, fitted.lens.with_values(**{name: value}), strength, model)
+                ln_evidence(fitted.likelihood, fitted.lens.with_values(**{name: value}), strength, model)
                 for value in pair
             )
             jumps.append(abs(high - low))

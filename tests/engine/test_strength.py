@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from engine.errors import InversionError, SpecError
-from engine.inversion.evidence import invert, ln_evidence
-from engine.inversion.operator import LinearData
-from engine.inversion.regularisation import SourceModel
-from engine.inversion.strength import find_strength
+from engine.likelihood.amplitudes import LinearData
+from engine.likelihood.evidence import invert, ln_evidence
+from engine.likelihood.strength import find_strength
+from engine.source.regularisation import SourceModel
 from tests.engine.dense_oracle import LENS, Case
 
 MODELS = [
@@ -18,9 +18,9 @@ MODELS = [
 ]
 
 
-def brent(operator, model) -> float:
+def brent(likelihood, model) -> float:
     found = minimize_scalar(
-        lambda t: -ln_evidence(operator, LENS, float(t), model),
+        lambda t: -ln_evidence(likelihood, LENS, float(t), model),
         bounds=(-20.0, 10.0),
         method="bounded",
         options={"xatol": 1e-6},
@@ -30,36 +30,36 @@ def brent(operator, model) -> float:
 
 @pytest.mark.parametrize("model", MODELS, ids=str)
 def test_the_strength_is_the_maximum_of_the_evidence_with_its_curvature(model: SourceModel) -> None:
-    operator = Case(amplitudes=2).operator()
-    best = brent(operator, model)
-    found = find_strength(operator, LENS, model)
+    likelihood = Case(amplitudes=2).likelihood()
+    best = brent(likelihood, model)
+    found = find_strength(likelihood, LENS, model)
     # Asked for is 1e-3. Brent itself cannot do better than the square root of rounding in ln Z.
     assert found.ln_lambda == pytest.approx(best, abs=1e-3)
     step = 0.05
-    values = [ln_evidence(operator, LENS, best + k * step, model) for k in (-2, -1, 0, 1, 2)]
+    values = [ln_evidence(likelihood, LENS, best + k * step, model) for k in (-2, -1, 0, 1, 2)]
     # The five-point second difference is exact to step^4 / 90 of the sixth derivative.
     numeric = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (12 * step**2)
     # The last Newton step, below 0.03, is not followed by a factorisation.
     assert found.curvature == pytest.approx(numeric, rel=0.003)
-    expected = invert(operator, LENS, best, model).effective_parameters()
+    expected = invert(likelihood, LENS, best, model).effective_parameters()
     assert found.effective_parameters == pytest.approx(expected, rel=0.005)
 
 
 @pytest.mark.parametrize("away", [-15.0, -6.0, -1.0, 0.0, 1.0, 6.0, 15.0])
 def test_few_factorisations_find_the_strength_from_anywhere(away: float) -> None:
-    operator, model = Case(amplitudes=2).operator(), SourceModel((12, 12))
-    best = brent(operator, model)
-    found = find_strength(operator, LENS, model, start=best + away)
+    likelihood, model = Case(amplitudes=2).likelihood(), SourceModel((12, 12))
+    best = brent(likelihood, model)
+    found = find_strength(likelihood, LENS, model, start=best + away)
     assert found.ln_lambda == pytest.approx(best, abs=1e-3)
     assert found.factorisations <= (3 if abs(away) <= 1 else 6)
 
 
 def test_strong_regularisation_leaves_the_evidence_of_no_source() -> None:
     scene, model = Case(amplitudes=2), SourceModel((8, 8))
-    operator = scene.operator()
-    alone = -0.5 * operator.dd + operator.ln_constant
+    likelihood = scene.likelihood()
+    alone = -0.5 * likelihood.dd + likelihood.ln_constant
     # D^T H^-1 D / 2 lambda and tr(H^-1 F) / 2 lambda are left.
-    assert ln_evidence(operator, LENS, 60.0, model) == pytest.approx(alone, abs=1e-6)
+    assert ln_evidence(likelihood, LENS, 60.0, model) == pytest.approx(alone, abs=1e-6)
 
 
 def test_data_without_a_source_have_no_strength() -> None:
@@ -67,37 +67,37 @@ def test_data_without_a_source_have_no_strength() -> None:
     # Data half as noisy as their noise map says: the evidence rises until there is no source at all.
     noise = 0.5 * np.sqrt(scene.covariance) * np.random.default_rng(5).normal(size=scene.data.size)
     scene.linear = LinearData(noise, scene.covariance, scene.columns)
-    operator = scene.operator()
+    likelihood = scene.likelihood()
     for start in (None, *np.arange(-12.0, 80.0, 4.0)):
         with pytest.raises(InversionError, match="stands out"):
-            find_strength(operator, LENS, model, start=start)
+            find_strength(likelihood, LENS, model, start=start)
 
 
 def test_a_host_below_the_noise_is_inverted_and_its_strength_large() -> None:
     scene, model = Case(amplitudes=0), SourceModel((9, 9))
-    operator = scene.operator()
-    bright = find_strength(operator, LENS, model)
+    likelihood = scene.likelihood()
+    bright = find_strength(likelihood, LENS, model)
     rng = np.random.default_rng(2)
-    inversion = invert(operator, LENS, bright.ln_lambda, model)
-    arc = operator.blurring @ inversion.mapping.apply(inversion.source.ravel())
+    inversion = invert(likelihood, LENS, bright.ln_lambda, model)
+    arc = likelihood.blurring @ inversion.lensing.apply(inversion.source.ravel())
     sigma = np.sqrt(scene.covariance)
     # Even the brightest pixel is at 0.9 sigma.
     faint_data = 0.9 / (arc / sigma).max() * arc + sigma * rng.normal(size=arc.size)
     scene.linear = LinearData(faint_data, scene.covariance, scene.columns)
-    faint = find_strength(scene.operator(), LENS, model)
+    faint = find_strength(scene.likelihood(), LENS, model)
     assert faint.ln_lambda > bright.ln_lambda + 2
     assert 0 < faint.effective_parameters < 0.5 * bright.effective_parameters
 
 
 def test_an_interval_the_wrong_way_round_is_refused() -> None:
     with pytest.raises(SpecError, match="ln lambda"):
-        find_strength(Case(amplitudes=0).operator(), LENS, SourceModel((6, 6)), low=1.0, high=-1.0)
+        find_strength(Case(amplitudes=0).likelihood(), LENS, SourceModel((6, 6)), low=1.0, high=-1.0)
 
 
 def test_an_interval_without_the_maximum_is_refused_at_either_side() -> None:
-    operator, model = Case(amplitudes=1).operator(), SourceModel((9, 9))
-    best = find_strength(operator, LENS, model).ln_lambda
+    likelihood, model = Case(amplitudes=1).likelihood(), SourceModel((9, 9))
+    best = find_strength(likelihood, LENS, model).ln_lambda
     with pytest.raises(InversionError, match="upper"):
-        find_strength(operator, LENS, model, low=best - 9.0, high=best - 3.0)
+        find_strength(likelihood, LENS, model, low=best - 9.0, high=best - 3.0)
     with pytest.raises(InversionError, match="lower"):
-        find_strength(operator, LENS, model, low=best + 3.0, high=best + 9.0)
+        find_strength(likelihood, LENS, model, low=best + 3.0, high=best + 9.0)

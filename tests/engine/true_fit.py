@@ -6,9 +6,9 @@ import numpy as np
 
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.modelling.parametric import ParametricFit
-from engine.modelling.point_sources import Detection
-from engine.scene import Scene
+from engine.parametric.fit import ParametricFit
+from engine.parametric.point_sources import Detection
+from engine.simulation.scene import Scene
 
 
 def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) -> ParametricFit:

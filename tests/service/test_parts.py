@@ -30,7 +30,7 @@ from engine.result import (
     RunResult,
     StageTime,
 )
-from engine.spec import Analysis
+from engine.spec.analysis import Analysis
 from service.answers import LIMIT_BYTES, NotPlainError, read_answers, to_bytes
 from service.api.app import create_app
 from service.artefacts import ArtefactStore

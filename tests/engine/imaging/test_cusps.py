@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from engine.catalogue import load_camera, load_dither
-from engine.imaging.blurring import convolve
+from engine.imaging.convolution import convolve
 from engine.imaging.cusps import place_cusps
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import exposure_geometry

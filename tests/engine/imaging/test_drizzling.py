@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from engine.errors import ObservationError
-from engine.imaging.blurring import convolve, point_source_image
+from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.drizzled_psf import drizzled_psf
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance, drizzled_variance
 from engine.imaging.exposures import expose

@@ -5,15 +5,16 @@ import pytest
 from scipy.special import erf
 
 from engine.conventions import pixel_centres
-from engine.imaging.blurring import convolve
-from engine.imaging.blurring_matrix import exposed_blurring_matrix
+from engine.imaging.convolution import convolve
 from engine.imaging.drizzling import drizzle
 from engine.imaging.exposures import expose
-from engine.imaging.extended import lensed_sersic_image
-from engine.imaging.response import PointResponse
-from engine.scene import build_scene
-from engine.simulation import Simulation
-from engine.spec import Host, Realization
+from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.exposed_matrix import exposed_blurring_matrix
+from engine.imaging.optics.extended import lensed_sersic_image
+from engine.simulation.scene import build_scene
+from engine.simulation.simulate import Simulation
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
 from tests.engine.imaging.conftest import Setup
 
 

@@ -3,7 +3,7 @@ import pytest
 from scipy.special import ndtr
 
 from engine.errors import ObservationError, SpecError
-from engine.imaging.blurring import convolve, point_source_image
+from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, resized
 

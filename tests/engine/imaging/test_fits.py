@@ -117,7 +117,7 @@ def test_files_that_are_not_observations_are_refused(tmp_path):
 
 def test_the_exposures_behind_an_observation_are_kept(tmp_path):
     from engine.imaging.geometry import exposure_geometry
-    from engine.imaging.response import PointResponse
+    from engine.imaging.optics.exposed import PointResponse
 
     geometry = exposure_geometry(load_camera("WFC3-IR_F160W"), load_dither("eight_point_quarter_pixel"), (12, 12))
     grid = np.arange(21) - 10

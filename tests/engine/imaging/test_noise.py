@@ -6,7 +6,7 @@ import pytest
 from engine.catalogue import load_camera, load_system
 from engine.errors import ObservationError
 from engine.imaging.noise import draw_noise, exposure_noise
-from engine.spec import ExposurePlan
+from engine.spec.instrument import ExposurePlan
 
 F160W = load_camera("WFC3-IR_F160W")
 PLAN = ExposurePlan(field_pixels=98, dither="eight_point_quarter_pixel", long_s=599.0, n_long=2, short_s=43.98)

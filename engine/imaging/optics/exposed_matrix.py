@@ -1,0 +1,174 @@
+"""The blurring matrix of an image whose exposures are known: each pixel's own PSF, dithers, drizzle and all.
+
+Drizzling is not a convolution: how a pixel of light spreads over the image depends on where it stands among the native
+pixels. One drizzled PSF for the whole image leaves an F160W arc of 20.5 mag wrong by 0.4 (n = 2) to 0.7 (n = 4) times
+its noise (rms), and cutting it at 1.2 arcsec by as much again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, sparse
+
+from engine.compiled import kernel
+from engine.conventions import FloatArray
+from engine.imaging.drizzling import drizzle_weights
+from engine.imaging.optics.exposed import PointResponse
+
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+_NODES = 8
+"""Sub-pixels along each axis between which the response is interpolated: Lagrange polynomials of order 7."""
+_LEAST_TRANSFER = 0.4
+_BLOCK = 512
+_GUARD = 16
+"""Sub-pixels of zeros round the PSF, against wrapping."""
+
+
+def _native_response(response: PointResponse, spacing: float, subrays: int | None) -> FloatArray:
+    """Response of a native pixel, by the offset [sub-pixels] of its first sub-pixel from the light: odd square.
+
+    The light is a pixel's mean over ``subrays`` rays a side, or its integral (None), ``spacing`` sub-pixels wide: the
+    PSF is divided by the transfer function of that average, because the light has been smoothed by it already.
+    """
+    geometry = response.geometry
+    factor = geometry.oversampling
+    pad = _GUARD + 2 * factor
+    psf = np.pad(response.psf, pad)
+    fy, fx = fft.fftfreq(psf.shape[0]), fft.rfftfreq(psf.shape[1])
+
+    def transfer(f: FloatArray) -> FloatArray:
+        # Light is integrated over sub-pixels; native pixels sum `factor` of them, beginning with the one at the offset.
+        native = sum(np.exp(2j * np.pi * f * k) for k in range(factor))
+        smoothed = np.sinc(f * spacing) if subrays is None else np.sinc(f * spacing) / np.sinc(f * spacing / subrays)
+        # Beyond the band of the optics there is nothing to restore, but the average has its zeros there.
+        return np.asarray(np.sinc(f) * native / np.maximum(smoothed, _LEAST_TRANSFER))
+
+    detector = np.zeros((fy.size, fx.size), dtype=np.complex128)
+    for (j, i), weight in np.ndenumerate(response.detector_kernel):
+        shift = np.exp(-2j * np.pi * factor * (fy[:, None] * (j - 1) + fx[None, :] * (i - 1)))
+        detector += weight * shift
+    spectrum = fft.rfft2(psf) * detector * transfer(fy)[:, None] * transfer(fx)[None, :]
+    return np.asarray(fft.irfft2(spectrum, psf.shape))
+
+
+@kernel
+def _lagrange(fraction: float, out: FloatArray) -> None:
+    """Weights of the nodes -3 ... 4 for a value at ``fraction`` in [0, 1)."""
+    for k in range(8):
+        weight = 1.0
+        for other in range(8):
+            if other != k:
+                weight *= (fraction + 3.0 - other) / (k - other)
+        out[k] = weight
+
+
+@kernel
+def _shift(values: FloatArray, fy: float, fx: float, half_shifted: FloatArray, out: FloatArray) -> None:
+    """Interpolate ``values`` at [a - 1 + fy, b - 1 + fx] into ``out``, first along x, then along y."""
+    wx, wy = np.empty(8), np.empty(8)
+    _lagrange(fx, wx)
+    _lagrange(fy, wy)
+    half_shifted[:, :] = 0.0
+    out[:, :] = 0.0
+    size = values.shape[0]
+    for a in range(size):
+        for k in range(8):
+            for b in range(max(0, 4 - k), min(size, size + 4 - k)):
+                half_shifted[a, b] += wx[k] * values[a, b + k - 4]
+    for a in range(size):
+        for k in range(max(0, 4 - a), min(8, size + 4 - a)):
+            for b in range(size):
+                out[a, b] += wy[k] * half_shifted[a + k - 4, b]
+
+
+@kernel
+def _fill_matrix(
+    out: FloatArray,
+    native: FloatArray,
+    indptr: NDArray[np.int32],
+    first_row: NDArray[np.int64],
+    first_column: NDArray[np.int64],
+    shares: FloatArray,
+    to_row: NDArray[np.int64],
+    to_column: NDArray[np.int64],
+    of_row: NDArray[np.int64],
+    of_column: NDArray[np.int64],
+    at_row: FloatArray,
+    at_column: FloatArray,
+    radius: int,
+) -> None:
+    size = native.shape[0]
+    centre = size // 2
+    half_shifted, shifted = np.empty((size, size)), np.empty((size, size))
+    for p in range(of_row.size):
+        row, column = int(np.floor(at_row[p])), int(np.floor(at_column[p]))
+        # Offsets of the sub-pixels from the light are whole numbers less the light's fraction.
+        _shift(native, 1.0 - (at_row[p] - row), 1.0 - (at_column[p] - column), half_shifted, shifted)
+        for m in range(to_row.size):
+            if abs(to_row[m] - of_row[p]) > radius or abs(to_column[m] - of_column[p]) > radius:
+                continue
+            total = 0.0
+            for e in range(indptr[m], indptr[m + 1]):
+                a, b = first_row[e] - row + centre, first_column[e] - column + centre
+                if 0 <= a < size and 0 <= b < size:
+                    total += shares[e] * shifted[a, b]
+            out[m, p] = total
+
+
+def exposed_blurring_matrix(
+    response: PointResponse, to: Pixels, of: Pixels, subrays: int | None, radius: int
+) -> sparse.csr_matrix:
+    """B of shape (len(to), len(of)): what drizzled pixel ``to`` receives of the light of pixel ``of``.
+
+    Parameters
+    ----------
+    response : PointResponse
+    to, of : (rows, columns)
+        Pixels of the drizzled image.
+    subrays : int or None
+        The light of a pixel is the mean over subrays x subrays points of it, or its integral.
+    radius : int
+        Pixels farther apart than this along either axis do not see each other.
+    """
+    geometry = response.geometry
+    scale = geometry.drizzled_scale / geometry.subpixel_scale
+    native = _native_response(response, scale, subrays)
+    reach = int(np.ceil((radius + 1) * geometry.drizzled_scale / geometry.subpixel_scale)) + 4 * geometry.oversampling
+    if reach < native.shape[0] // 2:
+        cut = native.shape[0] // 2 - reach
+        native = np.ascontiguousarray(native[cut:-cut, cut:-cut])
+    ny, nx = geometry.drizzled_shape
+    weights = drizzle_weights(geometry)[to[0] * nx + to[1]]
+    index, row, column = np.unravel_index(weights.indices, (geometry.n_dither, *geometry.native_shape))
+    shift_x, shift_y = np.array(geometry.subpixel_shifts).T
+    factor = geometry.oversampling
+    high_y, high_x = geometry.high_resolution_shape
+    to_row, to_column = to[0].astype(np.int64), to[1].astype(np.int64)
+    first_row = geometry.margin + shift_y[index] + factor * row
+    first_column = geometry.margin + shift_x[index] + factor * column
+    at_row = np.asarray((of[0] - (ny - 1) / 2) * scale + (high_y - 1) / 2, dtype=np.float64)
+    at_column = np.asarray((of[1] - (nx - 1) / 2) * scale + (high_x - 1) / 2, dtype=np.float64)
+    blocks = []
+    # Dense in between, a few columns at a time: all of a large image at once would need gigabytes.
+    for start in range(0, of[0].size, _BLOCK):
+        some = slice(start, start + _BLOCK)
+        block = np.zeros((to_row.size, of[0][some].size))
+        _fill_matrix(
+            block,
+            native,
+            weights.indptr.astype(np.int32),
+            first_row,
+            first_column,
+            weights.data.astype(np.float64),
+            to_row,
+            to_column,
+            of[0][some].astype(np.int64),
+            of[1][some].astype(np.int64),
+            at_row[some],
+            at_column[some],
+            radius,
+        )
+        blocks.append(sparse.csc_matrix(block))
+    return sparse.hstack(blocks, format="csr")

@@ -1,0 +1,1 @@
+"""The forward simulation: from a specification to a scene to an observation."""

@@ -1,0 +1,187 @@
+"""From a realization (sky frame, magnitudes) to a scene (image frame, count rates): the one place that converts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from engine.catalogue import load_camera, load_dither, load_system
+from engine.conventions import image_angle, magnitude_to_rate, sky_to_image, sky_to_image_shear
+from engine.errors import SpecError
+from engine.lensing.lens_equation import LensedImage, solve_lens_equation
+from engine.lensing.power_law import PowerLawLens
+from engine.light.sersic import SersicProfile
+from engine.spec.instrument import NOMINAL_OPTICS, Camera, Dither, Optics
+from engine.spec.realization import Realization
+from engine.spec.sky import AgnImage, LensSystem, MassModel, SersicLight
+
+
+@dataclass(frozen=True)
+class PointSource:
+    """A point source in the image: position [arcsec, image frame] and count rate [e-/s]."""
+
+    name: str
+    x: float
+    y: float
+    flux: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What stands before the telescope, in the image frame."""
+
+    system: LensSystem
+    camera: Camera
+    lens: PowerLawLens
+    host: SersicProfile
+    deflector: SersicProfile | None
+    agn: tuple[PointSource, ...]
+    optics: Optics = NOMINAL_OPTICS
+
+
+def resolve_system(realization: Realization) -> LensSystem:
+    """The lens system of a realization, from the catalogue where it is named."""
+    system = realization.system
+    return load_system(system) if isinstance(system, str) else system
+
+
+def resolve_camera(realization: Realization) -> Camera:
+    """The camera of a realization: its own choice, else the system's."""
+    camera = realization.camera
+    if camera is None:
+        camera = resolve_system(realization).camera
+    return load_camera(camera) if isinstance(camera, str) else camera
+
+
+def resolve_dither(system: LensSystem) -> Dither:
+    """The dither pattern of a system's exposures, from the catalogue where it is named."""
+    dither = system.exposures.dither
+    return load_dither(dither) if isinstance(dither, str) else dither
+
+
+def check_system(system: LensSystem) -> None:
+    """Refuse a system that cannot be simulated.
+
+    Its camera and dither pattern must be known, and each of its mass models must make as many images of the AGN as
+    ``agn`` lists (any number where it lists none); a SpecError names the field.
+    """
+    if isinstance(system.camera, str):
+        load_camera(system.camera)
+    resolve_dither(system)
+    for model, by_slope in system.mass_models.items():
+        for l_eta, mass in by_slope.items():
+            if not system.agn:
+                continue
+            images = solve_lens_equation(power_law_lens(mass), *sky_to_image(mass.source_position))
+            if len(images) != len(system.agn):
+                raise SpecError(
+                    "agn",
+                    [image.name for image in system.agn],
+                    f"{len(images)} images, as many as mass_models.{model}[{l_eta!r}] makes of its source",
+                )
+
+
+def check_analysis(realization: Realization) -> None:
+    """Refuse an analysis that asks for what the system has not.
+
+    Priors of the shear need a mass model with shear, positions as data two AGN images; a SpecError names the field.
+    """
+    system, analysis = resolve_system(realization), realization.analysis
+    mass = system.mass_model(realization.mass_model, realization.l_eta)
+    if not any(mass.shear or ()):
+        for name in ("gamma1", "gamma2"):
+            if name in analysis.priors or name in system.priors:
+                raise SpecError("analysis.priors", name, f"a lens parameter of {system.name}, whose model has no shear")
+    if analysis.agn_position_sd is not None and len(system.agn) < 2:
+        raise SpecError("analysis.agn_position_sd", analysis.agn_position_sd, "nothing: there are no two AGN images")
+
+
+def power_law_lens(mass: MassModel) -> PowerLawLens:
+    """A catalogue's mass model in the image frame."""
+    x, y = sky_to_image(mass.centre)
+    gamma1, gamma2 = sky_to_image_shear(mass.shear or (0.0, 0.0))
+    return PowerLawLens(
+        theta_E=mass.theta_E,
+        q=mass.q,
+        phi=image_angle(mass.position_angle),
+        slope=mass.slope,
+        x=x,
+        y=y,
+        gamma1=gamma1,
+        gamma2=gamma2,
+    )
+
+
+def sersic_profile(light: SersicLight, zero_point: float) -> SersicProfile:
+    """A catalogue's light profile in the image frame."""
+    x, y = sky_to_image(light.centre)
+    return SersicProfile(
+        flux=magnitude_to_rate(light.magnitude, zero_point),
+        r_eff=light.r_eff,
+        n=light.n,
+        q=light.q,
+        phi=image_angle(light.position_angle),
+        x=x,
+        y=y,
+    )
+
+
+def place_agn(
+    images: tuple[LensedImage, ...], observed: tuple[AgnImage, ...], zero_point: float
+) -> tuple[PointSource, ...]:
+    """Point sources at the lens-equation images, with the catalogue's magnitudes of the nearest observed images.
+
+    The pairing minimises the summed squared distance. A SpecError tells where the lens makes another number of images
+    than the catalogue has.
+    """
+    if len(images) != len(observed):
+        raise SpecError(
+            "agn", [image.name for image in observed], f"as many images as the lens equation has: {len(images)}"
+        )
+    model = np.array([(image.x, image.y) for image in images])
+    sky = np.array([sky_to_image(image.position) for image in observed])
+    distance2 = ((sky[:, None, :] - model[None, :, :]) ** 2).sum(axis=2)
+    rows, columns = linear_sum_assignment(distance2)
+    return tuple(
+        PointSource(
+            observed[row].name,
+            images[column].x,
+            images[column].y,
+            magnitude_to_rate(observed[row].magnitude, zero_point),
+        )
+        for row, column in zip(rows, columns, strict=True)
+    )
+
+
+def build_scene(realization: Realization) -> Scene:
+    """The scene of a realization."""
+    system, camera = resolve_system(realization), resolve_camera(realization)
+    mass = system.mass_model(realization.mass_model, realization.l_eta)
+    lens = power_law_lens(mass)
+    source_x, source_y = sky_to_image(mass.source_position)
+    spec = realization.host
+    host_angle = system.host_position_angle if spec.position_angle is None else spec.position_angle
+    host = SersicProfile(
+        flux=magnitude_to_rate(spec.magnitude, camera.zero_point),
+        r_eff=spec.r_eff,
+        n=spec.n,
+        q=system.host_q if spec.q is None else spec.q,
+        phi=image_angle(host_angle),
+        x=source_x,
+        y=source_y,
+    )
+    deflector = None if system.deflector is None else sersic_profile(system.deflector, camera.zero_point)
+    agn: tuple[PointSource, ...] = ()
+    if system.agn:
+        agn = place_agn(solve_lens_equation(lens, source_x, source_y), system.agn, camera.zero_point)
+    return Scene(
+        system=system,
+        camera=camera,
+        lens=lens,
+        host=host,
+        deflector=deflector,
+        agn=agn,
+        optics=realization.optics or NOMINAL_OPTICS,
+    )

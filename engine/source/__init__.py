@@ -1,0 +1,1 @@
+"""The source plane: grid, expected brightness, regularisation, and the matrix that lenses a source."""
