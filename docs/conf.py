@@ -1,11 +1,11 @@
-"""Sphinx: the site is the Markdown beside this file; what code knows better is taken from the code (docs/_extensions)."""
+"""Sphinx: the site is the Markdown beside this file; what the code knows better, docs/_extensions takes from it."""
 
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
 
-from service import VERSION  # noqa: E402 - the path first
+from service import VERSION
 
 project = "hostlens"
 author = "The hostlens developers"
@@ -24,14 +24,14 @@ exclude_patterns = ["_extensions"]
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
-# Executed anew where a page or the engine has changed, else taken from the cache.
-nb_execution_mode = "cache"
-nb_execution_cache_path = str(Path(__file__).parent.parent / "build" / "docs-cache")
+# At each build: what a cell shows is the engine's, whose changes no cache would see.
+nb_execution_mode = "force"
 nb_execution_timeout = 120
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 
-autodoc_typehints = "none"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True}
 napoleon_numpy_docstring = True
@@ -40,6 +40,8 @@ napoleon_use_rtype = False
 add_module_names = False
 
 html_theme = "pydata_sphinx_theme"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_title = "hostlens"
 html_theme_options = {
     "navigation_with_keys": False,

@@ -23,6 +23,8 @@ ROOT = DOCS.parent
 OUTSIDE = "_outside"
 """Folder of the copies, beside the pages; made anew at each build."""
 COPIED = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/LEDGER.md", "deploy/**/*.md")
+FIRST = ("engine.run", "engine.measure", "engine.analyse", "engine.compare", "engine.result", "engine.grid")
+"""What most look for."""
 _MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
 _LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")
 
@@ -31,7 +33,7 @@ def cli_markdown() -> str:
     """Every command with its arguments and options."""
     import typer.main  # noqa: PLC0415 - the tests use the other halves of this module alone
 
-    from service.cli import app  # noqa: PLC0415 - as above
+    from service.cli.app import app  # noqa: PLC0415 - as above
 
     return "\n".join(_commands("hostlens", typer.main.get_command(app)))
 
@@ -122,16 +124,20 @@ def _type(schema: dict[str, Any]) -> str:
         return f"[{name}](#{name.lower()})"
     if "enum" in schema or "const" in schema:
         return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
-    for choice in ("anyOf", "oneOf", "allOf"):
-        if choice in schema:
-            return " or ".join(_type(found) for found in schema[choice])
-    kind = schema.get("type", "anything")
+    choices = schema.get("anyOf") or schema.get("oneOf") or schema.get("allOf")
+    if choices:
+        return " or ".join(map(_type, choices))
+    return _plain_type(schema)
+
+
+def _plain_type(schema: dict[str, Any]) -> str:
+    kind, others = schema.get("type", "anything"), schema.get("additionalProperties")
+    if "prefixItems" in schema:
+        return f"[{', '.join(map(_type, schema['prefixItems']))}]"
     if kind == "array":
-        if "prefixItems" in schema:
-            return f"[{', '.join(_type(found) for found in schema['prefixItems'])}]"
         return f"list of {_type(schema.get('items', {}))}"
-    if kind == "object" and isinstance(schema.get("additionalProperties"), dict):
-        return f"table of {_type(schema['additionalProperties'])}"
+    if kind == "object" and isinstance(others, dict):
+        return f"table of {_type(others)}"
     return f"{kind}{_bounds(schema)}"
 
 
@@ -143,7 +149,7 @@ def _bounds(schema: dict[str, Any]) -> str:
 
 
 def engine_markdown() -> str:
-    """Everything that ``engine`` exports, by the package that it comes from; types that only fields have are left out."""
+    """Everything that ``engine`` exports, by package; the types of single fields are left out."""
     import engine  # noqa: PLC0415 - as above
 
     rooms: dict[str, list[str]] = {}
@@ -152,7 +158,9 @@ def engine_markdown() -> str:
         if inspect.isclass(found) or inspect.isfunction(found):
             rooms.setdefault(".".join(found.__module__.split(".")[:2]), []).append(name)
     out = []
-    for room, names in rooms.items():
+    for room, names in sorted(
+        rooms.items(), key=lambda item: (FIRST.index(item[0]) if item[0] in FIRST else len(FIRST), item[0])
+    ):
         out.append(f"## {room}\n\n{_first_paragraph(importlib.import_module(room))}\n")
         out += [
             _documented("engine", name, "###") for name in sorted(names, key=lambda name: (name[0].isupper(), name))
@@ -177,8 +185,11 @@ def _documented(module: str, name: str, level: str = "##") -> str:
         out += "\n| field | type | default |\n|---|---|---|\n"
         hints = inspect.get_annotations(found)
         for field in dataclasses.fields(found):
-            given = field.default is not dataclasses.MISSING and not callable(field.default)
-            default = f"`{field.default!r}`" if given else ""
+            # Pydantic keeps what it is told of a field in the place of its default.
+            factory = getattr(field.default, "default_factory", field.default_factory)
+            default = "" if field.default is dataclasses.MISSING else f"`{field.default!r}`"
+            if callable(factory):
+                default = f"`{factory.__name__}()`"
             out += f"| `{field.name}` | {_cell(str(hints.get(field.name, '')))} | {_cell(default)} |\n"
     return out
 
@@ -236,9 +247,15 @@ def _outdated(_: Any, env: Any, *__: Any) -> list[str]:
     return [name for name in env.found_docs if _MARK.search(Path(env.doc2path(name)).read_text())]
 
 
+def _signature(_: Any, kind: str, __: str, found: Any, ___: Any, signature: str, returns: str) -> Any:
+    """Fields of a dataclass are told by a table, whose types are those of the source."""
+    return ("", None) if kind == "class" and dataclasses.is_dataclass(found) else (signature, returns)
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Called by Sphinx."""
     app.connect("builder-inited", _copy)
     app.connect("source-read", _read)
     app.connect("env-get-outdated", _outdated)
+    app.connect("autodoc-process-signature", _signature)
     return {"parallel_read_safe": True}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from service.api.app import create_app
-from service.settings import Settings
+from service.runtime.settings import Settings
 from tests.docs.pages import ROOT
 
 FILE = ROOT / "docs" / "reference" / "openapi.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import shlex
 from collections.abc import Iterator
@@ -74,9 +75,8 @@ def commands(page: Path) -> Iterator[list[str]]:
             found = _split(line)
         except ValueError:  # no line of a shell: a quotation mark alone, say
             continue
-        for command in found:
-            while command and re.fullmatch(r"\w+=.*", command[0]):
-                command = command[1:]
+        for words in found:
+            command = list(itertools.dropwhile(lambda word: re.fullmatch(r"\w+=.*", word), words))
             if command:
                 yield command
 

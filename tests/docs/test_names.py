@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 import typer.main
 
-from service.cli import app
-from service.settings import DEPLOYMENT, OTHERS, Settings
+from service.cli.app import app
+from service.runtime.settings import DEPLOYMENT, OTHERS, Settings
 from tests.docs.pages import PAGES, ROOT, STANDING, anchors, blocks, commands, inline_code, links
 
+_IMPORT = re.compile(r"^from ((?:engine|service)[\w.]*) import ([\w, ]+)$", re.MULTILINE)
 by_page = pytest.mark.parametrize("page", STANDING, ids=lambda page: str(page.relative_to(ROOT)))
 
 

@@ -7,8 +7,8 @@ import re
 
 from pydantic_core import PydanticUndefined
 
-from service.settings import Settings
-from service.store.states import TRANSITIONS, RunState
+from service.domain.states import TRANSITIONS, RunState
+from service.runtime.settings import Settings
 from tests.docs.openapi import FILE, document_text
 from tests.docs.pages import ROOT
 
