@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from service.domain.views import GridView, RunDetail, RunView, SystemItem
+from service.domain.views import GridView, Links, RunView, SystemItem
 
 _ACTIONS = ("cancel", "pause", "resume", "retry")
-_RunT = TypeVar("_RunT", bound=RunView)
 _SystemT = TypeVar("_SystemT", bound=SystemItem)
 
 
@@ -24,17 +23,22 @@ def link_grids(grids: Sequence[GridView]) -> list[GridView]:
     return [link_grid(grid) for grid in grids]
 
 
-def link_run(run: _RunT) -> _RunT:
-    """A run with the addresses of its grid and, where there is one, of its figure."""
-    links = {"self": f"/v1/runs/{run.id}", "grid": f"/v1/grids/{run.grid_id}"}
-    if isinstance(run, RunDetail) and run.result is not None and run.result.figure is not None:
-        links["figure"] = f"/v1/runs/{run.id}/figure"
-    return run.model_copy(update={"links": links})
+def link_runs(runs: Sequence[RunView]) -> list[RunView]:
+    """Each with its own address and that of its grid."""
+    return [run.model_copy(update={"links": _run_links(run.id, run.grid_id)}) for run in runs]
 
 
-def link_runs(runs: Sequence[_RunT]) -> list[_RunT]:
-    """Each as :func:`link_run`."""
-    return [link_run(run) for run in runs]
+def link_document(document: dict[str, Any]) -> dict[str, Any]:
+    """A run as plain data, with these addresses and, where it has one, that of its figure."""
+    links = _run_links(document["id"], document["grid_id"])
+    result = document["result"]
+    if result is not None and result["figure"] is not None:
+        links["figure"] = f"{links['self']}/figure"
+    return document | {"links": links}
+
+
+def _run_links(run_id: str, grid_id: str) -> Links:
+    return {"self": f"/v1/runs/{run_id}", "grid": f"/v1/grids/{grid_id}"}
 
 
 def link_system(system: _SystemT) -> _SystemT:

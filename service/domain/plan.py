@@ -16,6 +16,7 @@ class PlannedRun:
     spec: dict[str, Any]
     inputs: dict[str, Any]
     digest: str
+    kind: str = "realization"
 
 
 class Plan(Protocol):

@@ -22,6 +22,8 @@ from service.runtime.process import PARENT_FD
 
 T = TypeVar("T")
 _MARK = "HOSTLENS_DRILL_MARK"
+PATIENCE_S = 120.0
+"""How long anything is waited for that takes a moment, or ten seconds, on a machine that has nothing else to do."""
 
 
 class DidNotHappenError(RuntimeError):
@@ -35,7 +37,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def eventually(look: Callable[[], T], timeout_s: float = 30.0, what: str = "it") -> T:
+def eventually(look: Callable[[], T], timeout_s: float = PATIENCE_S, what: str = "it") -> T:
     """Wait until ``look`` gives something that is true; a DidNotHappenError names what did not happen."""
     until = time.monotonic() + timeout_s
     while time.monotonic() < until:
@@ -125,7 +127,7 @@ class Installation:
                 stderr=log,
             )
 
-    def wait_ready(self, workers: int = 1, timeout_s: float = 90.0) -> None:
+    def wait_ready(self, workers: int = 1, timeout_s: float = 2 * PATIENCE_S) -> None:
         """Wait until it computes with at least so many worker threads."""
         eventually(lambda: self.is_ready(workers), timeout_s, "readiness")
 
@@ -194,7 +196,7 @@ class Installation:
     def end(self, number: int = signal.SIGINT) -> int:
         """Stop the service as a user would; its exit code."""
         self.process.send_signal(number)
-        return self.process.wait(timeout=40)
+        return self.process.wait(timeout=PATIENCE_S)
 
     def kill_all(self) -> None:
         """End every process that is left, at once."""
@@ -202,9 +204,9 @@ class Installation:
         for process in left:
             with suppress(psutil.Error):
                 process.kill()
-        psutil.wait_procs(left, timeout=10)
+        psutil.wait_procs(left, timeout=PATIENCE_S)
         for started in self.started:
-            started.wait(timeout=20)
+            started.wait(timeout=PATIENCE_S)
         self.client.__exit__()
         for end in self._pipe:
             os.close(end)

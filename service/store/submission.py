@@ -156,6 +156,7 @@ def _run_row(grid_id: str, ordinal: int, planned: PlannedRun, now: datetime) -> 
         "ordinal": ordinal,
         "label": planned.label,
         "paper_run": planned.paper_run,
+        "kind": planned.kind,
         "spec": planned.spec,
         "inputs": planned.inputs,
         "digest": planned.digest,

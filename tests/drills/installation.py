@@ -55,7 +55,7 @@ def installation(
         if ready:
             own.wait_ready()
         else:
-            eventually(own.readiness, 60, "an answer")
+            eventually(own.readiness, what="an answer")
         yield own
     finally:
         own.kill_all()
