@@ -234,6 +234,7 @@ def _system_fields(name: str) -> dict[str, Any]:
         "name": name,
         "camera": system.camera_name,
         "mass_models": {model: sorted(map(float, slopes)) for model, slopes in system.mass_models.items()},
+        "links": {},
     }
 
 

@@ -25,7 +25,7 @@ UWS_PHASES: dict[str, UwsPhase] = {
 
 
 Links = dict[str, str]
-"""Addresses by what they lead to. Only the API knows addresses, and fills them in."""
+"""Addresses by what they lead to: none before the API, which alone knows them, has filled them in."""
 
 
 class _Answer(BaseModel):
@@ -92,7 +92,7 @@ class GridView(_Answer):
     engine_digest: str | None
     """Of the engine whose results the grid takes: the one that was installed where it was submitted."""
     request: dict[str, Any]
-    links: Links = Field(default_factory=dict)
+    links: Links
 
 
 class GridPage(_Answer):
@@ -134,7 +134,7 @@ class RunView(_Answer):
     """It may have killed a worker, and is only run alone."""
     error: RunError | None
     finished_at: datetime | None
-    links: Links = Field(default_factory=dict)
+    links: Links
 
 
 class RunPage(_Answer):
@@ -336,7 +336,7 @@ class SystemItem(_Answer):
     camera: str
     mass_models: dict[str, list[float]]
     """l_eta of each mass model by its name."""
-    links: Links = Field(default_factory=dict)
+    links: Links
 
 
 class SystemList(_Answer):

@@ -76,6 +76,7 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         paused_at=row.paused_at,
         engine_digest=row.engine_digest,
         request=row.request,
+        links={},
     )
 
 
@@ -109,7 +110,6 @@ def run_document(
     """
     return {
         **_run_fields(row),
-        "links": {},
         "spec": row.spec,
         "digest": row.digest,
         "result": None if found is None else _result(found, estimates),
@@ -174,4 +174,5 @@ def _run_fields(row: Row[Any]) -> dict[str, Any]:
         "state": state,
         "uws_phase": UWS_PHASES[state],
         "error": error,
+        "links": {},
     }
