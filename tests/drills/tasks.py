@@ -31,6 +31,12 @@ def pictured(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     return payload
 
 
+def uneven(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
+    """Like brief, and then for up to twice as long again, by the seed: runs that begin together do not end so."""
+    time.sleep(seconds() * 2.0 * random.Random(spec["seed"]).random())
+    return brief(spec, artefact_url)
+
+
 def busy(spec: dict[str, Any], _artefact_url: str) -> dict[str, Any]:
     """A run that computes: as much of a core as brief sleeps, counted in CPU time, whatever else runs beside it."""
     payload = synthetic_payload(spec)
