@@ -75,7 +75,7 @@ def test_for_a_phone_the_figure_is_narrow_and_its_text_large():
 
 
 def test_the_same_points_in_any_order_are_the_same_bytes():
-    points = paper_grid(seeds=2)
+    points = paper_grid(seeds=2)[::4]
     shuffled = random.Random(3).sample(points, len(points))
     for kind, start in (("svg", b"<?xml"), ("png", b"\x89PNG")):
         first, second = (figure_bytes(bias_figure(some, heading="x"), kind) for some in (points, shuffled))
@@ -85,18 +85,18 @@ def test_the_same_points_in_any_order_are_the_same_bytes():
 
 
 def test_another_process_writes_the_same_bytes():
-    ours = [figure_bytes(figure, "svg") for figure in figures()]
+    ours = [figure_bytes(figure, "svg") for figure in itertools.islice(figures(), 2)]
     script = (
-        "import sys, hashlib; from tests.engine.bias_records import figure_bytes, figures\n"
-        "for f in figures(): print(hashlib.sha256(figure_bytes(f, 'svg')).hexdigest())"
+        "import hashlib, itertools; from tests.engine.bias_records import figure_bytes, figures\n"
+        "for f in itertools.islice(figures(), 2): print(hashlib.sha256(figure_bytes(f, 'svg')).hexdigest())"
     )
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
     assert found.stdout.split() == [hashlib.sha256(data).hexdigest() for data in ours]
 
 
 def test_figures_drawn_at_once_are_those_drawn_alone():
-    figures = [bias_figure(paper_grid()) for _ in range(3)]
-    alone, found = figure_bytes(bias_figure(paper_grid()), "svg"), {}
+    figures = [bias_figure(paper_grid()[::12]) for _ in range(3)]
+    alone, found = figure_bytes(bias_figure(paper_grid()[::12]), "svg"), {}
     threads = [
         threading.Thread(target=lambda i=i: found.update({i: figure_bytes(figures[i], "svg")})) for i in range(3)
     ]
