@@ -283,7 +283,7 @@ def test_processes_that_upgrade_at_once_take_turns(empties: Empties) -> None:
     url = empties()
     command = [sys.executable, "-c", f"from service.store.migrate import upgrade; upgrade({url!r})"]
     started = [subprocess.Popen(command, cwd=ROOT) for _ in range(3)]
-    assert [process.wait(timeout=60) for process in started] == [0, 0, 0]
+    assert [process.wait(timeout=120) for process in started] == [0, 0, 0]
     assert differences(url) is None
 
 
