@@ -4,32 +4,62 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, bindparam, false, func, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    bindparam,
+    case,
+    false,
+    func,
+    literal_column,
+    select,
+    update,
+)
 from sqlalchemy.exc import IntegrityError
 
 from service.domain.identifiers import utc_now
+from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
-from service.store.pace import recent
+from service.store.pace import recent, recent_of
 from service.store.pieces import Turns
-from service.store.rows import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
+from service.store.rows import (
+    ATTEMPT_COLUMNS,
+    ESTIMATE_COLUMNS,
+    RUN_COLUMNS,
+    ended_grid_view,
+    grid_view,
+    run_document,
+    run_view,
+)
 from service.store.settling import IS_OPEN, settle
-from service.store.submission import Plan, Submission, give_up, store
+from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
-from service.store.tables import attempt, event, grid, idempotency, result, run
+from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""
 _BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
+
+
+def _run_counts() -> Iterator[ColumnElement[int]]:
+    """Runs of a grid in each state, by a look at the index alone; none where they were written down at its end."""
+    for state in RunState:
+        mine = (run.c.grid_id == grid.c.id) & (run.c.state == literal_column(f"'{state}'"))
+        counted = select(func.count()).select_from(run).where(mine).correlate(grid).scalar_subquery()
+        yield case((grid.c.ending.is_(None), counted)).label(f"{state}_runs")
+
+
 # Made once: to make a statement takes as long as to carry it out.
-_GRID = select(grid).where(grid.c.id == bindparam("wanted"), WHOLE)
+_GRID = select(grid, *_run_counts()).where(grid.c.id == bindparam("wanted"), WHOLE)
 _COUNTS = (
     select(run.c.grid_id, run.c.state, func.count().label("runs"))
     .where(run.c.grid_id.in_(bindparam("ids", expanding=True)))
@@ -37,7 +67,8 @@ _COUNTS = (
 )
 _RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
 _RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
-_ATTEMPTS = select(attempt).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
+_ESTIMATES = select(*ESTIMATE_COLUMNS).where(estimate.c.run_id == bindparam("wanted"))
+_ATTEMPTS = select(*ATTEMPT_COLUMNS).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
 
 
 class NotFoundError(LookupError):
@@ -149,13 +180,20 @@ class GridStore:
         return RunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
 
     def run(self, wanted: str) -> RunDetail:
-        """One run with result and attempts, from one picture of the database, so that they fit each other."""
+        """One run with result and attempts, checked."""
+        return RunDetail.model_validate(self.run_document(wanted))
+
+    def run_document(self, wanted: str) -> dict[str, Any]:
+        """The same as plain data, from one picture of the database, so that its parts fit each other."""
+        parameters = {"wanted": wanted}
         with self._database.read() as connection:
-            row = connection.execute(_RUN, {"wanted": wanted}).one_or_none()
+            row = connection.execute(_RUN, parameters).one_or_none()
             if row is None:
                 raise NotFoundError(f"there is no run {wanted}")
-            found = connection.execute(_RESULT, {"wanted": wanted}).one_or_none()
-            return run_detail(row, found, connection.execute(_ATTEMPTS, {"wanted": wanted}).all())
+            found = connection.execute(_RESULT, parameters).one_or_none()
+            estimates = [] if found is None else connection.execute(_ESTIMATES, parameters).all()
+            attempts = connection.execute(_ATTEMPTS, parameters).all()
+        return run_document(row, found, estimates, attempts)
 
     def cancel(self, grid_id: str) -> GridView:
         """Mark the grid, so that nothing of it is started and the dispatcher stops what is running; end what is queued.
@@ -247,7 +285,10 @@ class GridStore:
         row = connection.execute(_GRID, {"wanted": grid_id}).one_or_none()
         if row is None:
             raise NotFoundError(f"there is no grid {grid_id}")
-        return self._views(connection, [row])[0]
+        if row.ending is not None:
+            return ended_grid_view(row)
+        counts = {str(state): row._mapping[f"{state}_runs"] for state in RunState}
+        return grid_view(row, counts, recent_of(connection, grid_id), self._clock())
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()

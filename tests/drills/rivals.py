@@ -37,7 +37,7 @@ class StoppedWorker(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Stop a worker that is at a run; wake it when the grid has ended, if it is still there."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_DEADLINE_S": str(self.deadline_s)}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
             service.wait_ready(2)
@@ -89,7 +89,7 @@ class TwoDispatchers(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Start both without a supervisor, so that nobody brings the dead one back."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         folder = ground.folder / "drill"
         (folder / "data").mkdir(parents=True)
         upgrade(ground.database_url or f"sqlite:///{folder / 'data' / 'hostlens.sqlite'}")
@@ -102,7 +102,7 @@ class TwoDispatchers(Drill):
             before = Counter(service.executed())
             psutil.Process(int(first.holder.split("|")[1])).send_signal(signal.SIGKILL)
             killed = time.monotonic()
-            eventually(lambda: _leader(service).generation > first.generation, 60, "a new leader")
+            eventually(lambda: _leader(service).generation > first.generation, what="a new leader")
             leads = time.monotonic() - killed
             done = service.client.status(grid.id).counts.done
             progress(service, grid.id, done + 1)
@@ -131,7 +131,7 @@ class TwoDispatchers(Drill):
 
 def _leader(service: Installation) -> LeaderView:
     with closing(Database(service.database, pooled=False)) as database:
-        return eventually(Leadership(database).view, 30, "a leader") or _never()
+        return eventually(Leadership(database).view, what="a leader") or _never()
 
 
 def _never() -> LeaderView:
@@ -149,7 +149,6 @@ class Poison(Drill):
 
     runs: int = 120
     sleep_s: float = 0.2
-    batch: int = 1
 
     def run(self, ground: Ground) -> Report:
         """One run in forty is poison, by its seed."""
@@ -157,7 +156,6 @@ class Poison(Drill):
             "HOSTLENS_TASK": "tests.drills.tasks:poisonous",
             "HOSTLENS_DRILL_SLEEP": str(self.sleep_s),
             "HOSTLENS_RETRY_DELAY_S": "0.2",
-            "HOSTLENS_BATCH": str(self.batch),
         }
         guilty = {place for place in range(self.runs) if place % POISON_EVERY == 1}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
@@ -176,7 +174,7 @@ class Poison(Drill):
         return Report(
             self.name,
             f"{self.runs} runs of {self.sleep_s:g} s, {len(guilty)} of them poison, two local workers, "
-            f"{self.batch} at a time, {ground.backend}",
+            f"{ground.backend}",
             (
                 Figure("quarantined", len(quarantined)),
                 Figure("done", found.states.get("done", 0)),
