@@ -139,7 +139,7 @@ def _map_cell(x: float, y: float, side: float, sx: float, sy: float, p: FloatArr
 def _candidates(
     sx: float, sy: float, half: float, theta_E: float, p: FloatArray, a: FloatArray, found: FloatArray
 ) -> int:
-    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many, if they have room."""
+    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many, if room."""
     stack = np.empty((512, 4))
     # Off the lens by an irrational part, so that no corner and no centre ever falls on it.
     stack[0, 0], stack[0, 1] = p[5] + 0.0318309886 * half, p[6] + 0.0271828183 * half
@@ -207,7 +207,7 @@ def _same_image(
 def _images(
     candidates: FloatArray, sx: float, sy: float, theta_E: float, p: FloatArray, a: FloatArray, roots: FloatArray
 ) -> int:
-    """Distinct images reached from the candidate cells, written into ``roots`` (n, 2); how many, if they have room."""
+    """Distinct images reached from the candidate cells, written into ``roots`` (n, 2); how many, if room."""
     n = 0
     for c in range(candidates.shape[0]):
         for k in range(5):
