@@ -42,7 +42,7 @@ def test_a_chain_that_may_go_to_no_regularisation_at_all_stays_where_the_evidenc
         target = target_of(Case(amplitudes=1), -bound, bound)
         best = find_strength(target.likelihood, LENS, MODEL).ln_lambda
         laplace = find_optimum(target, target.vector(LENS, best), np.diag(SD**2))
-        chain = run_chain(target, laplace, walkers=20, max_steps=150, rng=np.random.default_rng(3))
+        chain = run_chain(target, laplace, walkers=20, max_steps=60, rng=np.random.default_rng(3))
         strengths = chain.flat()[:, -1]
         assert np.isfinite(chain.ln_posterior).all()
         found.append((strengths.mean(), strengths.std(), chain.summary.effective_samples))

@@ -72,6 +72,7 @@ def test_a_host_that_is_not_there_is_an_error_that_says_so() -> None:
         run(realization(magnitude=32.0))
 
 
+@pytest.mark.long
 def test_a_host_below_the_noise_is_no_ok_of_the_measurement_of_an_image() -> None:
     """A host of 28 mag in an image that is measured blindly.
 
@@ -191,6 +192,7 @@ def test_a_run_whose_model_does_not_describe_the_image_warns(close: RunResult) -
     assert any("chi2" in warning for warning in close.warnings)
 
 
+@pytest.mark.long
 def test_an_image_of_a_close_pair_that_is_taken_for_one_star_is_a_poor_fit() -> None:
     """The same pair in an image measured blindly: three stars are found.
 
