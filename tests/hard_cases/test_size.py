@@ -36,7 +36,7 @@ _PROBLEM = textwrap.dedent(
     model = SourceModel((20, 20))
     best = find_strength(problem.likelihood, scene.lens, model).ln_lambda
     found = invert(problem.likelihood, scene.lens, best, model)
-    arc = problem.likelihood.blurring @ found.mapping.apply(found.source.ravel())
+    arc = problem.likelihood.blurring @ found.lensing.apply(found.source.ravel())
     freedom = int(problem.mask.sum()) - problem.likelihood.amplitudes - found.effective_parameters()
     chi2 = problem.likelihood.chi2(arc, problem.likelihood.fit_amplitudes(arc)) / freedom
     print(json.dumps({
