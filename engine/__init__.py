@@ -8,7 +8,9 @@ import engine.home  # noqa: F401 - before Astropy is imported
 # isort: split
 
 from engine.acceptance import check_realization
+from engine.analyse import Reconstruction, analyse
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
+from engine.compare import compare
 from engine.digest import engine_digest, engine_versions
 from engine.errors import (
     EngineError,
@@ -36,10 +38,21 @@ from engine.imaging.external import NoiseFromImage, observation_from_arrays
 from engine.imaging.external_files import read_external_observation
 from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.observation import Observation
-from engine.inspection import InversionView, inspect_inversion, inspect_simulation
-from engine.measure import HostEstimate, ImageMeasurement, Measured, measure_image
-from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
-from engine.run import STAGES, Measurement, Truth, measure, run
+from engine.inspection import InversionView, inspect_inversion
+from engine.measure import ImageMeasurement, measure_image
+from engine.result import (
+    Aperture,
+    ChainSummary,
+    Estimate,
+    ImagePlane,
+    LensParameter,
+    Products,
+    Quantity,
+    RunResult,
+    SourcePlane,
+    StageTime,
+)
+from engine.run import inspect_simulation, run
 from engine.simulation.scene import check_analysis, check_system
 from engine.simulation.seeds import generator
 from engine.simulation.simulate import Simulation, simulate_realization
@@ -57,6 +70,7 @@ from engine.spec.realization import (
 )
 from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
+from engine.stages import STAGES
 from engine.user_files import read_camera, read_mapping, read_system
 
 __all__ = [
@@ -75,9 +89,9 @@ __all__ = [
     "Grid",
     "GridRun",
     "Host",
-    "HostEstimate",
     "Identifier",
     "ImageMeasurement",
+    "ImagePlane",
     "Indices",
     "InversionError",
     "InversionView",
@@ -85,8 +99,6 @@ __all__ = [
     "LensParameter",
     "LensSystem",
     "Magnitudes",
-    "Measured",
-    "Measurement",
     "NoiseFromImage",
     "NoiseLevel",
     "Observation",
@@ -98,20 +110,23 @@ __all__ = [
     "Quantity",
     "Radii",
     "Realization",
+    "Reconstruction",
     "Replicates",
     "RunResult",
     "Simulation",
     "Slopes",
+    "SourcePlane",
     "SpecError",
     "StageTime",
     "SystemChoice",
     "Systems",
-    "Truth",
+    "analyse",
     "camera_from_mapping",
     "camera_names",
     "check_analysis",
     "check_realization",
     "check_system",
+    "compare",
     "complaint",
     "engine_digest",
     "engine_versions",
@@ -122,7 +137,6 @@ __all__ = [
     "inspect_simulation",
     "load_camera",
     "load_system",
-    "measure",
     "measure_image",
     "observation_from_arrays",
     "path_steps",
