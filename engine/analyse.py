@@ -18,7 +18,7 @@ from engine.estimators.draws import source_draw
 from engine.estimators.image import image_estimate
 from engine.estimators.refit import refit_draws
 from engine.estimators.sersic_fit import Refit
-from engine.estimators.summaries import summarise, summarise_aperture
+from engine.estimators.summaries import summarise_all
 from engine.imaging.observation import Observation
 from engine.likelihood.evidence import Inversion
 from engine.likelihood.problem import Problem, prepare_problem
@@ -183,16 +183,8 @@ def _sample(
     with watch.stage("refit"):
         drawn = [name for name in analysis.estimators if name != "image"]
         refits = tuple(refit_draws(draws, drawn, fixed_index, rng))
-        summaries = [summarise(refit, observation.zero_point) for refit in refits]
-        on_maps = [refit for refit in refits if (refit.estimator, refit.index_prior) == ("paper", "wide")]
-        aperture = summarise_aperture(draws, on_maps[0], observation.zero_point) if on_maps else None
-    warnings = [
-        f"{refit.estimator} estimator, n {refit.index_prior}: not one of {len(refit.fits)} draws could be fitted"
-        for refit, summary in zip(refits, summaries, strict=True)
-        if summary is None
-    ]
-    if on_maps and aperture is None:
-        warnings.append("aperture: no drawn source has light within it")
+        answers = summarise_all(draws, refits, observation.zero_point)
+    warnings = list(answers.warnings)
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
@@ -212,8 +204,8 @@ def _sample(
         image_plane=image_plane,
         source_plane=inverted_source(best, flat, target.prior.names),
         refits=refits,
-        estimates=tuple(summary for summary in summaries if summary is not None),
-        aperture=aperture,
+        estimates=answers.estimates,
+        aperture=answers.aperture,
         warnings=tuple(warnings),
     )
 

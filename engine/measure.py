@@ -93,6 +93,11 @@ class ImageMeasurement:
     inversion: SampledInversion | None
 
     @property
+    def estimator(self) -> str:
+        """What its documents call the estimator whose answer ``host`` is."""
+        return _NAMES.get(self.host.estimator, self.host.estimator)
+
+    @property
     def inversion_chi2_per_dof(self) -> float | None:
         """Of the inversion, with the noise of ``chi2_per_dof`` where the exposures are not known; None without one."""
         if self.inversion is None:
@@ -109,7 +114,7 @@ class ImageMeasurement:
         fit, chain = self.fit, None if self.inversion is None else self.inversion.chain.summary
         return {
             "status": self.status,
-            "estimator": _NAMES.get(self.host.estimator, self.host.estimator),
+            "estimator": self.estimator,
             "host": _host_document(self.host),
             "lens": {name: _document(value) for name, value in self.lens.items()},
             "chi2_per_dof": self.chi2_per_dof,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -59,6 +60,32 @@ def summarise(refit: Refit, zero_point: float) -> Estimate | None:
         r_eff_at_bound=sum(fit.r_eff_at_bound for fit in fits),
         failed=len(refit.fits) - len(fits),
     )
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What the fits to drawn sources answer, and a warning for each answer that is not there."""
+
+    estimates: tuple[Estimate, ...]
+    aperture: Aperture | None
+    warnings: tuple[str, ...]
+
+
+def summarise_all(draws: Sequence[SourceDraw], refits: Sequence[Refit], zero_point: float) -> Summary:
+    """The answers of all estimators, and the light of the maps where ``paper`` says where its middle is."""
+    answers = [summarise(refit, zero_point) for refit in refits]
+    warnings = [
+        f"{refit.estimator} estimator, n {refit.index_prior}: not one of {len(refit.fits)} draws could be fitted"
+        for refit, answer in zip(refits, answers, strict=True)
+        if answer is None
+    ]
+    aperture = None
+    for refit in refits:
+        if (refit.estimator, refit.index_prior) == ("paper", "wide"):
+            aperture = summarise_aperture(draws, refit, zero_point)
+            if aperture is None:
+                warnings.append("aperture: no drawn source has light within it")
+    return Summary(tuple(answer for answer in answers if answer is not None), aperture, tuple(warnings))
 
 
 def summarise_aperture(draws: Sequence[SourceDraw], centres: Refit, zero_point: float) -> Aperture | None:

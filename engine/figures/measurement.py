@@ -122,7 +122,7 @@ def measurement_figure(found: ImageMeasurement) -> Figure:
     host = found.host
     figure.suptitle(
         f"host {host.magnitude.mean:.2f} ± {host.magnitude.sd:.2f} mag, R {host.r_eff.mean:.3f} ± "
-        f"{host.r_eff.sd:.3f}″, n {host.n.mean:.2f} ± {host.n.sd:.2f};   "
+        f"{host.r_eff.sd:.3f}″, n {host.n.mean:.2f} ± {host.n.sd:.2f} ({found.estimator});   "
         f"$\\theta_E$ {fit.lens.theta_E:.3f}″, q {fit.lens.q:.2f}, slope {fit.lens.slope:.2f}, shear "
         f"{math.hypot(fit.lens.gamma1, fit.lens.gamma2):.3f};   status {found.status}",
         fontsize=10.5,

@@ -11,12 +11,15 @@ from service.domain.payload import (
     LENS_PARAMETERS,
     QUANTITIES,
     AperturePayload,
+    ChainPayload,
     EstimateName,
     EstimatePayload,
     ResultPayload,
 )
 from service.store.leases import Lease
 from service.store.tables import INPUT_COLUMNS
+
+_CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
 
 
 def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now: datetime) -> dict[str, Any]:
@@ -31,8 +34,8 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
         value, prefix = payload.lens.get(name), f"lens_{name.lower()}"
         for part in ("mean", "sd", "truth"):
             row[f"{prefix}_{part}"] = None if value is None else getattr(value, part)
-    chain = payload.chain.model_dump()
-    row |= {"chain_status": chain.pop("status"), **chain}
+    chain = payload.chain
+    row |= {column: None if chain is None else getattr(chain, name) for name, column in _CHAIN.items()}
     plain = (
         "ln_evidence", "chi2", "degrees_of_freedom", "condition_number",
         "arc_magnitude", "agn_contrast", "surface_brightness", "wall_s", "cpu_s", "engine_digest",
