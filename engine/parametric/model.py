@@ -18,7 +18,7 @@ import numpy as np
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import PosteriorError
 from engine.imaging.observation import Observation
-from engine.imaging.optics.extended import StampBlur, lensed_sersic_image
+from engine.imaging.optics.stamp_blur import StampBlur
 from engine.imaging.optics.spline import place_spline, spline_coefficients
 from engine.lensing.power_law import PowerLawLens, source_position
 from engine.light.rendering import render_sersic, sample_sersic
@@ -172,7 +172,7 @@ class ImageModel:
     def _point(self, index: int, x: float, y: float) -> FloatArray:
         """Column of an AGN image. What the exposures make of it is remembered as long as it moves next to nothing."""
         stamp = self._stamp(x, y)
-        if self.observation.response is None or not self.exact:
+        if not self.exact:
             return stamp
         anchor = self._anchors.get(index)
         if anchor is None or math.hypot(x - anchor[0], y - anchor[1]) > _ANCHOR:
@@ -222,7 +222,7 @@ class ImageModel:
             lit.append((sersic_of(shape), None, float(amplitudes[layout.n_agn]), self._deflector(*shape.tolist())))
         defect = np.zeros(self.data.size)
         for profile, behind, brightness, column in lit:
-            exact = lensed_sersic_image(self.observation, profile, behind)[self.window]
+            exact = self.observation.optics.sersic_image(profile, behind)[self.window]
             defect += brightness * (exact.ravel() * self.weight - column)
         self.data = self._observed - defect
 

@@ -23,7 +23,7 @@ from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation, Provenance
-from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
@@ -144,7 +144,7 @@ def combine(scene: Scene, exposures: Exposures, provenance: Provenance | None = 
         valid=(spoilt == 0).reshape(geometry.drizzled_shape),
         provenance={**_exposure_record(scene, exposures), **(provenance or {})},
         centre=scene.system.coordinates,
-        response=PointResponse(
+        response=ExposedOptics(
             optical_psf(scene.camera, geometry.oversampling), geometry, detector_kernel(scene.camera)
         ),
     )

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from engine.imaging.drizzling import drizzle
-from engine.imaging.optics.extended import lensed_sersic_image
 from engine.lensing.power_law import kernel_arguments, source_position
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.evidence import invert, ln_evidence
@@ -120,7 +119,7 @@ def test_the_defect_makes_the_image_of_the_fitted_host_exact(seen: tuple[Simulat
     rays = problem.likelihood.rays
     assert rays.envelope is not None
     fluxes = np.append(rays.of_envelope(), 1.0)
-    exact = lensed_sersic_image(simulation.observation, rays.envelope.host, fit.lens)[problem.mask]
+    exact = simulation.observation.optics.sersic_image(rays.envelope.host, fit.lens)[problem.mask]
     assert np.abs(problem.likelihood.blurring @ fluxes - exact).max() < 1e-9 * exact.max()
 
 
