@@ -26,7 +26,7 @@ from benchmarks.timing import in_turns, least
 from engine.conventions import FloatArray, pixel_centres
 from engine.imaging.observation import Observation
 from engine.imaging.optics.stamp_matrix import blurring_matrix, central_stamp
-from engine.lensing.power_law import PowerLawLens, deflection, kernel_arguments
+from engine.lensing.power_law import PowerLawLens, deflection
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.likelihood.evidence import ln_evidence
 from engine.likelihood.problem import Problem, prepare_problem
@@ -47,7 +47,7 @@ def dense_ln_evidence(
     likelihood: MarginalLikelihood, lens: PowerLawLens, ln_lambda: float, model: SourceModel
 ) -> float:
     """The same number from explicit matrices, amplitudes as extra columns."""
-    mapping = map_rays(likelihood.rays, kernel_arguments(lens), model.shape)
+    mapping = map_rays(likelihood.rays, lens, model.shape)
     white = likelihood.whitened
     g = np.hstack([white.noise.whiten(likelihood.blurring @ mapping.dense()), white.columns])
     n, k = model.shape[0] * model.shape[1], white.columns.shape[1]

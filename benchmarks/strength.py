@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import least
 from engine.conventions import FloatArray
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
 from engine.likelihood.evidence import ln_evidence, normal_equations
 from engine.likelihood.problem import prepare_problem
@@ -66,7 +66,7 @@ def single_precision(
     exact = ln_evidence(likelihood, lens, ln_lambda, model)
     f, d = normal_equations(likelihood, lens, model)
     f = np.tril(f) + np.tril(f, -1).T
-    dense = map_rays(likelihood.rays, kernel_arguments(lens), model.shape).dense()
+    dense = map_rays(likelihood.rays, lens, model.shape).dense()
     w = likelihood.w_tilde.dense() - likelihood.border @ likelihood.border.T
     rounded_w = w.astype(np.float32).astype(np.float64)
     single = (dense.T.astype(np.float32) @ (w.astype(np.float32) @ dense.astype(np.float32))).astype(np.float64)

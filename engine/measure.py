@@ -19,8 +19,9 @@ from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
-from engine.parametric.fit import HOST_NAMES, Acceptance, ParametricFit, fit_parametric
+from engine.parametric.fit import HOST_NAMES, ParametricFit, fit_parametric
 from engine.parametric.residual_noise import noise_scale
+from engine.parametric.search import Acceptance
 from engine.result import Estimate, LensParameter
 from engine.run import Measurement, measure
 from engine.spec.analysis import PROFILES, Analysis

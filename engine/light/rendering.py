@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import SpecError
-from engine.lensing.power_law import PowerLawLens, trace_rays
-from engine.lensing.power_law import kernel_arguments as lens_arguments
+from engine.lensing.power_law import PowerLawLens, lens_constants, trace_rays
 from engine.light.brightness_bounds import brightness_range, length
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
 from engine.light.refinement import Tracer, refine_pixels
-from engine.light.sersic import SersicProfile
-from engine.light.sersic import kernel_arguments as sersic_arguments
+from engine.light.sersic import SersicProfile, sersic_constants
 
 DEFAULT_TOLERANCE = 1e-4
 """Estimated error of a pixel as a fraction of the brightest, and of all pixels together as a fraction of the flux."""
@@ -39,14 +37,14 @@ _HALO = 2
 
 def _tracer(profile: SersicProfile, lens: PowerLawLens | None) -> Tracer:
     """From image positions to the axes of the profile; without a lens nothing is deflected."""
-    light = sersic_arguments(profile)
+    light = sersic_constants(profile)
     if lens is None:
         return lambda x, y: to_profile_axes(x, y, light)
-    series = lens_arguments(lens)
+    constants = lens_constants(lens)
 
     def trace(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         bx, by = np.empty(x.size), np.empty(x.size)
-        trace_rays(x, y, *series, bx, by)
+        trace_rays(x, y, constants, bx, by)
         return to_profile_axes(bx, by, light)
 
     return trace

@@ -14,7 +14,7 @@ from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
 from engine.imaging.observation import Observation
 from engine.lensing.lens_equation import solve_lens_equation
-from engine.lensing.power_law import kernel_arguments, source_position
+from engine.lensing.power_law import source_position
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.parametric.fit import ParametricFit
 from engine.source.envelope import Envelope
@@ -95,7 +95,7 @@ def _noise(
 
 def _envelope(fit: ParametricFit, rays: RayBundle) -> Envelope:
     """The host of the parametric fit, placed by the AGN, on the scale of the source grid of its lens."""
-    grid = map_rays(rays, kernel_arguments(fit.lens), (2, 2)).grid
+    grid = map_rays(rays, fit.lens, (2, 2)).grid
     size = math.sqrt(float((grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])))
     x, y = 0.5 * (grid.x[0] + grid.x[-1]), 0.5 * (grid.y[0] + grid.y[-1])
     if rays.anchors.size:

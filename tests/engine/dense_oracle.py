@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from engine.imaging.optics.stamp_matrix import blurring_matrix
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.source.lensing_matrix import cast_rays, map_rays
 from engine.source.regularisation import SourceModel, regularisation_matrix
@@ -57,7 +57,7 @@ class Case:
             self.covariance = sigma**2
         self.columns = rng.normal(size=(m, amplitudes)) + 0.3
         model = SourceModel((12, 12))
-        mapping = map_rays(self.rays, kernel_arguments(LENS), model.shape)
+        mapping = map_rays(self.rays, LENS, model.shape)
         sx, sy = np.meshgrid(mapping.grid.x, mapping.grid.y)
         source = 4000.0 * np.exp(-0.5 * ((sx - 0.05) ** 2 + (sy + 0.03) ** 2) / 0.15**2)
         self.blurring = blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed))
@@ -75,7 +75,7 @@ class Case:
 
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""
-        mapping = map_rays(self.rays, kernel_arguments(lens), model.shape)
+        mapping = map_rays(self.rays, lens, model.shape)
         g = np.hstack([self.blurring @ mapping.dense(), self.columns])
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from engine.errors import InversionError, ObservationError
 from engine.imaging.convolution import convolve
 from engine.imaging.optics.stamp_matrix import central_stamp, pixel_kernel
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import LinearData, marginalise_amplitudes
 from engine.likelihood.evidence import Inversion, invert, ln_evidence
 from engine.source.lensing_matrix import RayBundle, cast_rays, map_rays
@@ -142,7 +142,7 @@ def test_a_mask_of_one_pixel_is_inverted_and_an_empty_one_refused() -> None:
     assert isinstance(invert(likelihood, LENS, 0.0, SourceModel((2, 2))), Inversion)
     nothing = cast_rays(~mask & mask, mask, axis, axis, SCALE, 2)
     with pytest.raises(InversionError, match="mask"):
-        map_rays(nothing, kernel_arguments(LENS), (4, 4))
+        map_rays(nothing, LENS, (4, 4))
 
 
 def test_noise_that_is_not_positive_and_dependent_amplitudes_are_refused() -> None:
@@ -158,7 +158,7 @@ def test_noise_that_is_not_positive_and_dependent_amplitudes_are_refused() -> No
 
 def test_rays_of_the_mask_are_inside_the_grid_and_those_far_outside_carry_no_light() -> None:
     scene = Case(subrays=1)
-    mapping = map_rays(scene.rays, kernel_arguments(LENS), (7, 7))
+    mapping = map_rays(scene.rays, LENS, (7, 7))
     inside = mapping.entries > 0
     assert inside[scene.rays.in_mask].all()
     total = np.array([mapping.weights[p, : mapping.entries[p]].sum() for p in range(mapping.entries.size)])

@@ -12,7 +12,7 @@ from engine.conventions import FloatArray
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
 
-Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+Pixels = tuple[NDArray[np.intp], ...]
 """Rows and columns of some pixels of the image."""
 
 

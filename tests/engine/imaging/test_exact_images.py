@@ -32,7 +32,9 @@ def test_a_column_is_the_drizzled_star_at_the_centre_of_its_pixel(setup: Setup) 
     matrix = response.blurring_matrix(every, of, 1, radius).toarray()  # type: ignore[arg-type]
     scale = setup.geometry.drizzled_scale
     for k, (row, column) in enumerate(zip(*of, strict=True)):
-        star = response.point_source(float(pixel_centres(nx, scale)[column]), float(pixel_centres(ny, scale)[row])).ravel()
+        star = response.point_source(
+            float(pixel_centres(nx, scale)[column]), float(pixel_centres(ny, scale)[row])
+        ).ravel()
         near = (np.abs(every[0] - row) <= radius) & (np.abs(every[1] - column) <= radius)
         # Interpolated between sub-pixels by polynomials of order 7; the drizzle package works in single precision.
         assert np.abs(matrix[near, k] - star[near]).max() < 3e-4 * star.max()
