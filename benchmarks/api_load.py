@@ -27,12 +27,12 @@ from pathlib import Path
 import httpx
 import psutil
 
-from service.drills.installation import eventually, free_port
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import upgrade
 from service.store.queue import RunQueue
+from tests.drills.installation import eventually, free_port
 from tests.service.plans import planned, result_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -43,8 +43,8 @@ CLIENTS = 50
 _UNDER_WAY = "hostlens_http_requests_in_progress"
 _SERVE = """
 import signal, threading
-from service.settings import Settings
-from service.supervisor import Supervisor
+from service.runtime.settings import Settings
+from service.runtime.supervisor import Supervisor
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda *_: stop.set())
 Supervisor(Settings(), modules=("service.api",)).run(stop)

@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 
-from service.drills.postgres import postgres_server
-from service.requests import GridRequest, plan
+from service.domain.requests import GridRequest, plan
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import upgrade
+from tests.drills.postgres import postgres_server
 
 
 def rival(url: str, stop: Event, longest: multiprocessing.Queue[tuple[float, int]]) -> None:

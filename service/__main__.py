@@ -3,7 +3,7 @@
 import signal
 import sys
 
-from service import start
+from service.runtime import start
 
 _SERVICES = frozenset({"serve", "api", "dispatcher", "scheduler", "worker"})
 
@@ -12,7 +12,7 @@ def main() -> None:
     """Run a command."""
     service = sys.argv[1:2] and sys.argv[1] in _SERVICES
     start.begin(service=bool(service))
-    from service.cli import app  # noqa: PLC0415 - takes a while
+    from service.cli.app import app  # noqa: PLC0415 - takes a while
 
     try:
         if not service:

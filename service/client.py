@@ -12,7 +12,7 @@ from urllib.parse import quote
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from service.schemas import EventPage, GridPage, GridView, Readiness, RunDetail, RunPage, RunView, Summary
+from service.domain.views import EventPage, GridPage, GridView, Readiness, RunDetail, RunPage, RunView, Summary
 
 _TIMEOUT_S = 60.0
 

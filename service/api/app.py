@@ -10,14 +10,14 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
 
 from service import VERSION
-from service.api import artefacts, catalogue, events, grids, health, problems
+from service.api import catalogue, downloads, events, grids, health, problems
 from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
 from service.api.metrics import Measured
 from service.api.observer import observing
-from service.schemas import Problem
-from service.settings import Settings
+from service.domain.views import Problem
+from service.runtime.settings import Settings
 
 _PROBLEM: dict[str, Any] = {
     "description": "A problem (RFC 9457)",
@@ -81,7 +81,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_middleware(Measured, metrics=context.metrics)
     problems.install(app)
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
-    artefacts.install(app)
+    downloads.install(app)
     for room in (grids, events, catalogue, health):
         app.include_router(room.router)
     return app

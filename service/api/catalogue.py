@@ -8,8 +8,8 @@ from fastapi import APIRouter, Path
 
 from engine import SpecError
 from service import VERSION
-from service.requests import engine_view, list_cameras, list_systems, system_view
-from service.schemas import CameraList, EngineView, SystemList, SystemView
+from service.domain.requests import engine_view, list_cameras, list_systems, system_view
+from service.domain.views import CameraList, EngineView, SystemList, SystemView
 from service.store.grids import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["catalogue"])

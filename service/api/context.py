@@ -6,16 +6,16 @@ from typing import Annotated
 
 from fastapi import Depends, Path, Query, Request
 
-from service import logs
 from service.api.hub import Hub
 from service.api.metrics import ApiMetrics
-from service.artefacts import ArtefactStore
-from service.identifiers import GRID_PATTERN, RUN_PATTERN
-from service.settings import Settings
+from service.domain.identifiers import GRID_PATTERN, RUN_PATTERN
+from service.runtime import logs
+from service.runtime.settings import Settings
+from service.store.artefacts import ArtefactStore
 from service.store.database import Database
-from service.store.events import EventStore
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
+from service.store.outbox import EventStore
 
 _IDS = frozenset({"grid_id", "run_id"})
 

@@ -15,7 +15,7 @@ from service.api.context import Context, GridId, Limit, Service
 from service.api.hub import Feed, FullError
 from service.api.pages import next_link
 from service.api.threads import QUICK, Route, run_in
-from service.schemas import EventPage
+from service.domain.views import EventPage
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=Route)
 _KEEP_ALIVE_S = 15.0

@@ -11,16 +11,16 @@ from fastapi.responses import JSONResponse
 from pydantic_core import to_json
 
 from engine import engine_digest
-from service.api.artefacts import artefact
 from service.api.bodies import JsonRoute
 from service.api.context import GridId, Limit, RunId, Service
+from service.api.downloads import artefact
 from service.api.pages import next_link
 from service.api.threads import patient
-from service.identifiers import GRID_PATTERN
-from service.requests import GridRequest, plan
-from service.schemas import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
+from service.domain.identifiers import GRID_PATTERN
+from service.domain.requests import GridRequest, plan
+from service.domain.states import RunState
+from service.domain.views import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
 from service.store.grids import NotFoundError
-from service.store.states import RunState
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
 _LOG = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.api.context import Context, Service
 from service.api.threads import PROBES, Route, patient, run_in
-from service.schemas import Health, Readiness
+from service.domain.views import Health, Readiness
 from service.store.leadership import LeaderView
 
 router = APIRouter(tags=["health"], route_class=Route)

@@ -18,10 +18,10 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.api.threads import EVENTS, run_in
-from service.schemas import EventPage, EventView
+from service.domain.views import EventPage, EventView
 from service.store.database import AWAY
-from service.store.events import EventStore
 from service.store.grids import NotFoundError
+from service.store.outbox import EventStore
 
 _LOG = logging.getLogger(__name__)
 _LOOK_S = 0.5

@@ -22,7 +22,7 @@ from prometheus_client.registry import Collector
 from sqlalchemy.exc import SQLAlchemyError
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.process import API_NUMBER, METRICS_DIR
+from service.runtime.process import API_NUMBER, METRICS_DIR
 from service.store.database import Database
 from service.store.depth import Depth, QueueDepth
 from service.store.leadership import Leadership

@@ -17,8 +17,8 @@ from starlette.exceptions import HTTPException
 
 from engine import SpecError, complaint, field_path, path_steps, spec_error
 from service.api.methods import allowed_methods, options
-from service.requests import TooManyRunsError
-from service.schemas import Place, Problem
+from service.domain.requests import TooManyRunsError
+from service.domain.views import Place, Problem
 from service.store.database import AWAY
 from service.store.faults import AccessRefusedError, SchemaMismatchError, StatementTooLongError
 from service.store.grids import KeyReusedError, NotFoundError

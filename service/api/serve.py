@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 
-from service import logs, preflight
 from service.api import transport
 from service.api.app import create_app
-from service.process import inherited_listener, spare_collector, stop_with_parent
-from service.settings import Settings
+from service.runtime import logs, preflight
+from service.runtime.process import inherited_listener, spare_collector, stop_with_parent
+from service.runtime.settings import Settings
 
 
 def serve(settings: Settings) -> None:
@@ -16,7 +16,7 @@ def serve(settings: Settings) -> None:
 
     Raises
     ------
-    service.settings.ConfigurationError
+    service.runtime.settings.ConfigurationError
         What the settings name is not there or cannot be used.
     """
     logs.configure(settings, "api")

@@ -20,7 +20,6 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.config import STARTUP_FAILURE
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
 
-from service import start
 from service.api.problems import problem
 from service.api.wire import (
     MAX_TARGET_BYTES,
@@ -31,7 +30,8 @@ from service.api.wire import (
     require_sound_head,
     without_upgrade,
 )
-from service.settings import Settings
+from service.runtime import start
+from service.runtime.settings import Settings
 
 _LOG = logging.getLogger(__name__)
 _MAX_HEAD_BYTES = 65_536

@@ -7,13 +7,13 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from service import logs
 from service.dispatcher.attribution import Deaths
-from service.dispatcher.endings import memory_exceeded, worker_lost
-from service.dispatcher.flight import Flight
+from service.dispatcher.flights import Flight
+from service.dispatcher.outcomes import memory_exceeded, worker_lost
 from service.dispatcher.pool import Pool
 from service.dispatcher.stalls import Stall
 from service.dispatcher.writer import Writer
+from service.runtime import logs
 from service.store.leases import Outcome
 
 _LOG = logging.getLogger(__name__)

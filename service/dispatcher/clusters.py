@@ -14,10 +14,10 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster, Security
 
-from service.dispatcher.host import take_host
-from service.dispatcher.nursery import ONE_THREAD
-from service.dispatcher.plain import only_plain_data
-from service.settings import Settings
+from service.dispatcher.cluster_process import take_host
+from service.dispatcher.pickle_guard import only_plain_data
+from service.runtime.settings import Settings
+from service.worker.fork_server import ONE_THREAD
 
 _OUR_RULES = {
     "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0",
@@ -53,7 +53,7 @@ def dask_config(settings: Settings) -> dict[str, Any]:
         "distributed.worker.memory.pause": 0.8,
         "distributed.worker.memory.terminate": 0.95,
         # Workers write the lines that the service writes, with the run on them.
-        "distributed.worker.preload": ["service.logs"],
+        "distributed.worker.preload": ["service.runtime.logs"],
         "distributed.comm.timeouts.connect": "10s",
         # Dask looks at itself fifty times a second in each process, for a dashboard that nobody sees; on two cores
         # this took 7 % of one from the engine.

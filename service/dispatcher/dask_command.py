@@ -3,7 +3,7 @@
 import signal
 import socket
 
-from service import start
+from service.runtime import start
 
 
 def run() -> None:

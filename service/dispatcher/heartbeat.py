@@ -8,8 +8,8 @@ import time
 
 from sqlalchemy.exc import DBAPIError
 
-from service import logs
-from service.settings import Settings
+from service.runtime import logs
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.leadership import Leadership
 

@@ -17,21 +17,21 @@ from typing import Any
 from distributed import KilledWorker
 from sqlalchemy.exc import SQLAlchemyError
 
-from service import logs
-from service.artefacts import ArtefactStore
 from service.dispatcher.ahead import Ahead
+from service.dispatcher.backlog import PATIENCE_S, Holding, NoRoomError
 from service.dispatcher.blame import Blame
-from service.dispatcher.endings import OtherEngine, overdue, read_artefacts, read_exception, read_part
-from service.dispatcher.flight import GATHER_S, Flight
+from service.dispatcher.flights import GATHER_S, Flight
 from service.dispatcher.heartbeat import Heartbeat
-from service.dispatcher.holding import PATIENCE_S, Holding, NoRoomError
-from service.dispatcher.metrics import DispatcherMetrics
+from service.dispatcher.outcomes import OtherEngine, overdue, read_artefacts, read_exception, read_part
+from service.dispatcher.pickle_guard import read_error
 from service.dispatcher.placement import Slots
-from service.dispatcher.plain import read_error
 from service.dispatcher.pool import Pool, Worker, is_lost
+from service.dispatcher.telemetry import DispatcherMetrics
 from service.dispatcher.writer import Writer
-from service.payload import ResultPayload
-from service.settings import Settings
+from service.domain.payload import ResultPayload
+from service.runtime import logs
+from service.runtime.settings import Settings
+from service.store.artefacts import ArtefactStore
 from service.store.faults import AWAY
 from service.store.leadership import LeadershipLostError
 from service.store.leases import Lease, Outcome, Pair

@@ -16,14 +16,14 @@ from dataclasses import dataclass, field
 from typing import Any
 from uuid import uuid4
 
-from service import logs
-from service.answers import NotPlainError, read_greeting
 from service.dispatcher.clusters import open_client
-from service.dispatcher.plain import read_error
+from service.dispatcher.pickle_guard import read_error
 from service.dispatcher.stalls import LOOK_S, Asked, Condition, Stall, Stalls, WorkerMemory, read_conditions
-from service.settings import Settings
+from service.runtime import logs
+from service.runtime.settings import Settings
 from service.store.leases import Lease
-from service.worker import call_tasks, greet
+from service.worker.answers import NotPlainError, read_greeting
+from service.worker.tasks import call_tasks, greet
 
 _LOG = logging.getLogger(__name__)
 _STOP_S = 5.0

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from service.answers import RUNNING
+from service.worker.answers import RUNNING
 
 LOOK_S = 2.0
 PATIENCE_S = 20.0

@@ -11,11 +11,11 @@ from typing import Any, NoReturn
 
 import dask.config
 
-from service import preflight, start
 from service.dispatcher.clusters import dask_config
-from service.dispatcher.nursery import ONE_THREAD
-from service.settings import Settings, bracketed
-from service.start import ConfigurationError
+from service.runtime import preflight, start
+from service.runtime.settings import Settings, bracketed
+from service.runtime.start import ConfigurationError
+from service.worker.fork_server import ONE_THREAD
 
 _DEATH_TIMEOUT_S = 60
 
@@ -25,7 +25,7 @@ def scheduler_arguments(settings: Settings, host: str, port: int, health: str) -
 
     Raises
     ------
-    service.settings.ConfigurationError
+    service.runtime.settings.ConfigurationError
         It could not listen where it is told to, or its certificates cannot be used.
     """
     host = host.removeprefix("[").removesuffix("]")
@@ -42,7 +42,7 @@ def worker_arguments(settings: Settings, address: str, workers: int, health: str
     preflight.require_certificates(settings)
     room = ["--nworkers", str(workers), "--nthreads", "1", "--memory-limit", settings.worker_memory]
     listen = ["--dashboard-address", health, "--no-dashboard", "--death-timeout", str(_DEATH_TIMEOUT_S)]
-    listen += ["--preload-nanny", "service.logs"]
+    listen += ["--preload-nanny", "service.runtime.logs"]
     return ["worker", address, *room, *listen, "--local-directory", settings.scratch, *_tls(settings)]
 
 
@@ -71,7 +71,7 @@ def _require_health(address: str) -> None:
 
 
 def _config(settings: Settings) -> dict[str, Any]:
-    flat = {**dask_config(settings), "distributed.scheduler.preload": ["service.logs"]}
+    flat = {**dask_config(settings), "distributed.scheduler.preload": ["service.runtime.logs"]}
     nested: dict[str, Any] = {}
     with dask.config.set(flat, config=nested):
         return deepcopy(nested)  # leaving the context empties it

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from service import logs
-from service.dispatcher.endings import unstorable
-from service.dispatcher.metrics import DispatcherMetrics
-from service.payload import ResultPayload
+from service.dispatcher.outcomes import unstorable
+from service.dispatcher.telemetry import DispatcherMetrics
+from service.domain.payload import ResultPayload
+from service.runtime import logs
 from service.store.faults import AWAY, StatementTooLongError
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure, RunQueue, Stored

@@ -8,11 +8,11 @@ from datetime import datetime
 
 from sqlalchemy import case, false, func, select, text
 
-from service.identifiers import utc_now
+from service.domain.identifiers import utc_now
+from service.domain.states import GridState, RunState
 from service.store.database import Database
 from service.store.leadership import LeaderView, leader_view
 from service.store.settling import held_grids
-from service.store.states import GridState, RunState
 from service.store.tables import grid, run
 
 

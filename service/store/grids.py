@@ -12,18 +12,18 @@ from typing import Any
 from sqlalchemy import Connection, Row, bindparam, false, func, select, update
 from sqlalchemy.exc import IntegrityError
 
-from service.identifiers import utc_now
-from service.schemas import GridPage, GridView, RunDetail, RunPage
+from service.domain.identifiers import utc_now
+from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
+from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent
 from service.store.pieces import Turns
+from service.store.rows import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
 from service.store.settling import IS_OPEN, settle
-from service.store.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.store.submission import Plan, Submission, give_up, store
 from service.store.summary import summarise
 from service.store.tables import attempt, event, grid, idempotency, result, run
-from service.store.views import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""

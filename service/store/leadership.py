@@ -10,7 +10,7 @@ from threading import Lock
 
 from sqlalchemy import Connection, insert, select, update
 
-from service.identifiers import utc_now
+from service.domain.identifiers import utc_now
 from service.store.database import Database
 from service.store.leases import Outcome, leased, requeue
 from service.store.tables import leader, run

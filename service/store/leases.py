@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, literal_column, select, update
 
+from service.domain.states import CANCEL, OPEN_STATES, PAUSE, QUARANTINE, REQUEUE, GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.faults import AWAY
 from service.store.pace import recent
-from service.store.states import CANCEL, OPEN_STATES, PAUSE, QUARANTINE, REQUEUE, GridState, RunState, move
 from service.store.tables import attempt, event, grid, run
+from service.store.transitions import move
 
 _LOG = logging.getLogger(__name__)
 AT_ONCE = 5000

@@ -11,8 +11,9 @@ from typing import Any
 
 from sqlalchemy import ColumnElement, Connection, exists, false, func, literal_column, or_, select, true, update
 
-from service.identifiers import new_token, utc_now
-from service.payload import ResultPayload
+from service.domain.identifiers import new_token, utc_now
+from service.domain.payload import ResultPayload
+from service.domain.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.database import Database
 from service.store.leadership import require_generation
@@ -35,9 +36,9 @@ from service.store.leases import (
 )
 from service.store.results import result_row
 from service.store.settling import held_grids
-from service.store.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState, move, moving
 from service.store.sums import add_to_sums
 from service.store.tables import attempt, grid, result, run
+from service.store.transitions import move, moving
 from service.store.upkeep import Upkeep
 
 _MAX_DELAY_S = 600.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Any
 
-from service.payload import (
+from service.domain.payload import (
     COUNTS,
     ESTIMATES,
     LENS_PARAMETERS,

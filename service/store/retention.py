@@ -14,10 +14,10 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, Select, Table, and_, case, delete, func, literal_column, select, tuple_
 
+from service.domain.states import RunState
 from service.store.database import Database
 from service.store.leases import lock_grids
 from service.store.pieces import PIECE, Turns
-from service.store.states import RunState
 from service.store.tables import attempt, event, grid, idempotency, result, run
 
 OPEN, YOUNGER, NEWEST = "its grid is open", "younger", "newest of its grid, which streams resume from"

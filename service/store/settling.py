@@ -12,10 +12,11 @@ from datetime import datetime
 
 from sqlalchemy import ColumnElement, Connection, Select, exists, literal_column, select, true, update
 
+from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState, Transition
 from service.store.leases import close_grids
 from service.store.pieces import PIECE, places
-from service.store.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState, Transition, move
 from service.store.tables import grid, run
+from service.store.transitions import move
 
 # Spelt out: a database takes a partial index only where it sees that the condition implies it.
 IS_OPEN = grid.c.state == literal_column(f"'{GridState.QUEUED}'")

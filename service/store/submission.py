@@ -15,13 +15,13 @@ from typing import Any, Protocol
 
 from sqlalchemy import Connection, Select, delete, func, insert, select, true, update
 
-from service.identifiers import new_grid_id, run_id
+from service.domain.identifiers import new_grid_id, run_id
+from service.domain.states import GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
 from service.store.pieces import PIECE, Turns, places
 from service.store.settling import IS_OPEN
-from service.store.states import GridState, RunState
 from service.store.tables import grid, idempotency, run
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, RowMapping, select
 
-from service.payload import ESTIMATES
-from service.schemas import GridView
+from service.domain.payload import ESTIMATES
+from service.domain.views import GridView
 from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_sum, input_sum
 
 _PARTS = ("shift", "shift2", "sd", "bias", "bias_runs")
@@ -30,7 +30,7 @@ _TRUE = [GROUP_COLUMNS.index(quantity) for quantity in SUMMED]
 def summarise(connection: Connection, grid: GridView, limit: int, offset: int = 0) -> dict[str, Any]:
     """Rows by input (all but the seed) and the whole grid, in the transaction that read the grid.
 
-    The answer is a :class:`service.schemas.Summary` as plain data, keys in the order of the models' fields. A page can
+    The answer is a :class:`~service.domain.views.Summary` as plain data, keys in the order of the fields. A page can
     hold two hundred thousand numbers: models of them take longer to make than all the rest, only to check what this
     module has written. ``next`` holds the offset of the next page of rows.
     """
@@ -50,7 +50,7 @@ def summarise(connection: Connection, grid: GridView, limit: int, offset: int = 
 
 
 def _rows(found: Sequence[Row[Any]]) -> list[dict[str, Any]]:
-    """Each a :class:`service.schemas.SummaryRow` as plain data."""
+    """Each a :class:`service.domain.views.SummaryRow` as plain data."""
     first = len(GROUP_COLUMNS) + 1
     inputs = [row[:first] for row in found]
     blocks = np.array([row[first:] for row in found]).reshape(len(found), len(ESTIMATES), -1)
@@ -71,7 +71,7 @@ def _rows(found: Sequence[Row[Any]]) -> list[dict[str, Any]]:
 def _estimates(
     counted: NDArray[np.float64], sums: NDArray[np.float64], inputs: Sequence[Sequence[Any]]
 ) -> list[dict[str, Any] | None]:
-    """One estimate of each row: a :class:`service.schemas.SummaryEstimate` as plain data, None where no run has it."""
+    """One estimate of each row: a :class:`~service.domain.views.SummaryEstimate` as plain data; None: no run has it."""
     runs = counted[:, 0]
     quantities = []
     for number, place in enumerate(_TRUE):
@@ -114,7 +114,7 @@ def _or_none(values: NDArray[np.float64], known: NDArray[np.bool_]) -> list[floa
 
 
 def _overall(row: Row[*tuple[Any, ...]], estimate: str) -> dict[str, Any] | None:
-    """One estimator over a grid: a :class:`service.schemas.OverallEstimate` as plain data."""
+    """One estimator over a grid: a :class:`service.domain.views.OverallEstimate` as plain data."""
     column = row._mapping
     runs = column[f"{estimate}_runs"]
     if not runs:

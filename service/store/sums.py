@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Insert, Integer, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.payload import ESTIMATES
+from service.domain.payload import ESTIMATES
 from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_sum, input_sum
 
 _INSERT: dict[str, Callable[[Table], sqlite.Insert | postgresql.Insert]] = {

@@ -28,7 +28,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
+from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
 
 REVISION = "0007"
 """Revision of the migrations that these tables are."""

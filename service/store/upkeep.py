@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from datetime import datetime
 
-from service.identifiers import utc_now
+from service.domain.identifiers import utc_now
 from service.store.database import Database
 from service.store.leases import lock_grids
 from service.store.settling import settle, unsettled

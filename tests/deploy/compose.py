@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from service.drills.installation import free_port
+from tests.drills.installation import free_port
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE = ROOT / "deploy" / "compose" / "compose.yaml"

@@ -19,11 +19,11 @@ import pytest
 import typer
 import yaml
 
-from service.cli import app
-from service.dispatcher.nursery import ONE_THREAD
-from service.settings import Settings
+from service.cli.app import app
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
+from service.worker.fork_server import ONE_THREAD
 from tests.deploy.compose import COMPOSE, ROOT, services
 from tests.service.conftest import new_database
 from tests.service.plans import submit

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, text
 
-from service.drills.postgres import FAST
-from service.drills.postgres import postgres_server as server
 from service.store.database import Database
 from service.store.migrate import upgrade
 from service.store.tables import metadata
+from tests.drills.postgres import FAST
+from tests.drills.postgres import postgres_server as server
 
 
 class Clock:

@@ -14,7 +14,7 @@ from typing import Any
 
 from sqlalchemy import Connection, event
 
-from service.identifiers import utc_now
+from service.domain.identifiers import utc_now
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership

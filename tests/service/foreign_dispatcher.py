@@ -6,8 +6,8 @@ import sys
 
 # Dask's workers import this module again when they are started; only the process itself dispatches.
 if __name__ == "__main__":
-    from service import identifiers
-    from service.dispatcher import holder
+    from service.dispatcher import identity
+    from service.domain import identifiers
 
     class Wrong(datetime.datetime):
         """The wall clock of that machine; what goes by at a steady pace is right everywhere."""
@@ -18,9 +18,9 @@ if __name__ == "__main__":
 
     identifiers.datetime = Wrong  # type: ignore[misc]
     # Or whoever looks would see that the process is dead: nothing is known of those elsewhere but their heartbeat.
-    holder._place = lambda: f"elsewhere-{os.getpid()}"
+    identity._place = lambda: f"elsewhere-{os.getpid()}"
 
-    from service.dispatcher.process import dispatch
-    from service.settings import Settings
+    from service.dispatcher.dispatch import dispatch
+    from service.runtime.settings import Settings
 
     sys.exit(dispatch(Settings()))

@@ -10,7 +10,7 @@ from typing import Any
 from distributed import get_worker
 from distributed.protocol.serialize import ToPickle
 
-import service.worker
+from service.worker import tasks
 from tests.service.tasks import fast
 
 _FOLDER = "HOSTLENS_DRILL_HARM"
@@ -42,8 +42,8 @@ _ANSWERS = {
     "not_json": b"\x80\x04.",
     "too_few": b'{"answers":[],"memory":1}',
 }
-_well = service.worker.call_tasks
-_greet_well = service.worker.to_bytes
+_well = tasks.call_tasks
+_greet_well = tasks.to_bytes
 
 
 def _call_tasks(task: str, specs: list[dict[str, Any]], *arguments: Any) -> Any:
@@ -54,7 +54,7 @@ def _call_tasks(task: str, specs: list[dict[str, Any]], *arguments: Any) -> Any:
 
 
 if _FOLDER in os.environ:  # in a worker, not where the tests themselves import this
-    service.worker.call_tasks = _call_tasks
+    tasks.call_tasks = _call_tasks
 
 
 def answer(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
@@ -82,4 +82,4 @@ def warm_up() -> None:
             raise HarmfulError
         if kind == "silence":
             time.sleep(3600)
-        service.worker.to_bytes = lambda _: Harmful()  # type: ignore[assignment, return-value]
+        tasks.to_bytes = lambda _: Harmful()  # type: ignore[assignment, return-value]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from service.payload import ResultPayload, read_payload
-from service.requests import GridRequest, plan
+from service.domain.payload import ResultPayload, read_payload
+from service.domain.requests import GridRequest, plan
 from service.store.grids import GridStore
 from service.store.leases import Lease
 from service.store.submission import PlannedRun

@@ -17,7 +17,7 @@ from typing import Any
 import psycopg
 import pytest
 
-from service.drills.installation import free_port
+from tests.drills.installation import free_port
 
 _START_S = 30.0
 

@@ -40,16 +40,16 @@ from hypothesis.stateful import (
 from sqlalchemy import Connection, event, func, select
 from sqlalchemy.exc import OperationalError
 
-from service.drills.drill import THROW_AWAY
-from service.drills.postgres import FAST, postgres_server
+from service.domain.states import TERMINAL_STATES, RunState
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership, LeadershipLostError
 from service.store.leases import Lease, Outcome
 from service.store.migrate import upgrade
 from service.store.queue import Failure, RunQueue, Stored
-from service.store.states import TERMINAL_STATES, RunState
 from service.store.tables import attempt, grid, result, run
+from tests.drills.drill import THROW_AWAY
+from tests.drills.postgres import FAST, postgres_server
 from tests.service.conftest import Clock, empty
 from tests.service.plans import body, planned, result_of
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.drills.installation import Installation, eventually, free_port
+from tests.drills.installation import Installation, eventually, free_port
 
 __all__ = ["ROOT", "Serving", "eventually", "free_port", "serving"]
 

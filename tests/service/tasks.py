@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from service.artefacts import ArtefactStore
-from service.drills.tasks import PNG, moody, synthetic_payload
-from service.drills.tasks import brief as fast
+from service.store.artefacts import ArtefactStore
+from tests.drills.tasks import PNG, moody, synthetic_payload
+from tests.drills.tasks import brief as fast
 
 __all__ = ["PNG", "fast", "heavy", "moody", "synthetic_payload"]
 

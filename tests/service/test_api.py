@@ -11,10 +11,10 @@ from fastapi.testclient import TestClient
 
 from engine.catalogue import system_names
 from service.api.app import create_app
-from service.artefacts import ArtefactStore
-from service.identifiers import new_grid_id, run_id, utc_now
-from service.payload import ESTIMATES, ArtefactPayload
-from service.settings import Settings
+from service.domain.identifiers import new_grid_id, run_id, utc_now
+from service.domain.payload import ESTIMATES, ArtefactPayload
+from service.runtime.settings import Settings
+from service.store.artefacts import ArtefactStore
 from service.store.database import Database
 from service.store.leadership import Leadership
 from service.store.migrate import upgrade

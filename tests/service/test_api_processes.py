@@ -10,7 +10,7 @@ from pathlib import Path
 import httpx
 import psutil
 
-from service.drills.installation import Installation
+from tests.drills.installation import Installation
 from tests.service.service_process import eventually, serving
 
 API = ["-m", "service.api"]

@@ -22,18 +22,18 @@ from fastapi.testclient import TestClient
 from fsspec.implementations.memory import MemoryFileSystem
 
 from service.api.app import create_app
-from service.artefacts import ArtefactDamagedError, ArtefactGoneError, ArtefactStore, ArtefactStoreError, keeping
-from service.dispatcher import holding as holding_module
-from service.dispatcher.endings import read_artefacts
-from service.dispatcher.holding import Holding, NoRoomError
-from service.dispatcher.metrics import DispatcherMetrics
-from service.payload import ArtefactPayload, InvalidResultError, ResultPayload, read_payload
-from service.settings import Settings
+from service.dispatcher import backlog
+from service.dispatcher.backlog import Holding, NoRoomError
+from service.dispatcher.outcomes import read_artefacts
+from service.dispatcher.telemetry import DispatcherMetrics
+from service.domain.payload import ArtefactPayload, InvalidResultError, ResultPayload, read_payload
+from service.runtime.settings import Settings
+from service.store.artefacts import ArtefactDamagedError, ArtefactGoneError, ArtefactStore, ArtefactStoreError, keeping
 from service.store.database import Database
 from service.store.leadership import Leadership
 from service.store.leases import Lease
 from service.store.queue import Failure
-from service.worker import call_task
+from service.worker.tasks import call_task
 from tests.service.plans import body
 from tests.service.tasks import PNG, synthetic_payload
 from tests.service.test_api import assert_problem, work
@@ -261,7 +261,7 @@ def test_a_store_that_says_nothing_holds_nobody_up_and_few_calls_hang(tmp_path: 
 def test_one_artefact_that_says_nothing_is_refused_and_the_store_is_not_away(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(holding_module, "_FIRST_BACK_OFF_S", 0.0)
+    monkeypatch.setattr(backlog, "_FIRST_BACK_OFF_S", 0.0)
     store = ArtefactStore(str(tmp_path / "store"), patience_s=0.1)
     holding = Holding(store, tmp_path, DispatcherMetrics())
     held = [held_result(number) for number in range(3)]
@@ -321,7 +321,7 @@ def test_a_store_behind_a_driver_keeps_checks_and_heals() -> None:
 
 def test_a_worker_sends_home_what_the_store_does_not_take(tmp_path: Path) -> None:
     with away(tmp_path / "store"):
-        answer = call_task("service.drills.tasks:pictured", SPEC, str(tmp_path / "store"))
+        answer = call_task("tests.drills.tasks:pictured", SPEC, str(tmp_path / "store"))
     payload = read_payload(answer["payload"])
     artefacts = read_artefacts(payload, [answer], 0)
     assert payload.figure is not None
@@ -329,7 +329,7 @@ def test_a_worker_sends_home_what_the_store_does_not_take(tmp_path: Path) -> Non
     assert artefacts.keys() == {payload.figure.key, payload.products.key}
     assert artefacts[payload.figure.key].startswith(PNG)
     with keeping() as kept:
-        again = call_task("service.drills.tasks:pictured", SPEC, str(tmp_path / "store"))
+        again = call_task("tests.drills.tasks:pictured", SPEC, str(tmp_path / "store"))
     assert "artefacts" not in again
     assert kept == {}
 
@@ -356,7 +356,7 @@ def test_a_payload_cannot_name_an_artefact_otherwise_than_by_its_digest(key: str
 class Pictured(InstantPool):
     """Every run has a figure and products of its own."""
 
-    task = "service.drills.tasks:pictured"
+    task = "tests.drills.tasks:pictured"
 
 
 class Heavy(InstantPool):
@@ -420,7 +420,7 @@ def test_without_its_store_a_dispatcher_does_not_even_start_what_it_could_not_ke
 def test_one_artefact_that_is_refused_for_what_it_is_stops_nobody_else(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(holding_module, "_FIRST_BACK_OFF_S", 0.001)
+    monkeypatch.setattr(backlog, "_FIRST_BACK_OFF_S", 0.001)
     setting = setting_of(database, tmp_path)
     plain = setting.pool.folder / "plain"
     plain.mkdir()
@@ -477,9 +477,9 @@ def held_result(number: int) -> tuple[ResultPayload, dict[str, bytes]]:
 def test_more_than_memory_should_keep_waits_in_a_file_without_a_name_and_beyond_it_there_is_no_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(holding_module, "_IN_MEMORY", 3000)
-    monkeypatch.setattr(holding_module, "_ON_DISK", 4500)
-    monkeypatch.setattr(holding_module, "_LEFT_FREE", 0)
+    monkeypatch.setattr(backlog, "_IN_MEMORY", 3000)
+    monkeypatch.setattr(backlog, "_ON_DISK", 4500)
+    monkeypatch.setattr(backlog, "_LEFT_FREE", 0)
     folder = tmp_path / "store"
     holding = Holding(ArtefactStore(str(folder)), tmp_path / "scratch", DispatcherMetrics())
     for turn in range(3):  # the room is there again once it is empty

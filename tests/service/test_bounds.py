@@ -16,7 +16,7 @@ import pytest
 from pydantic import ValidationError
 
 from engine import SpecError, check_realization, realization_from_dict
-from service.requests import GridRequest, TooManyRunsError, plan
+from service.domain.requests import GridRequest, TooManyRunsError, plan
 
 OWN = tomllib.loads((Path(__file__).resolve().parents[2] / "docs" / "examples" / "my_system.toml").read_text("utf-8"))
 CAMERA = {

@@ -25,7 +25,7 @@ from sqlalchemy import select
 
 from engine import engine_digest
 from service.dispatcher.clusters import dask_config, kubernetes_spec, security_of, slurm
-from service.settings import Settings
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership

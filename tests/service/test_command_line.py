@@ -19,8 +19,8 @@ from fastapi.testclient import TestClient
 from typer.testing import CliRunner, Result
 
 from service.api.app import create_app
-from service.cli import app
-from service.settings import Settings
+from service.cli.app import app
+from service.runtime.settings import Settings
 from tests.service.service_process import ROOT, free_port, serving
 
 NOBODY = "http://127.0.0.1:1"
@@ -137,15 +137,6 @@ WRONG = {
     "a result into a device": ("measure", "image.fits", "--json", os.devnull),
     "a result twice": ("measure", "image.fits", "--json", "x.png", "--figure", "x.png"),
     "a result over the image": ("measure", "image.fits", "--fits", "image.fits"),
-    "a drill that there is not": ("drill", "nonsense"),
-    "a size that there is not": ("drill", "cancel", "days=3"),
-    "a size without a number": ("drill", "cancel", "runs=many"),
-    "a size without a value": ("drill", "cancel", "runs"),
-    "no runs": ("drill", "cancel", "runs=0"),
-    "a size below 0": ("drill", "sqlite-lock", "lock_s=-1"),
-    "a size that is NaN": ("drill", "sqlite-lock", "lock_s=nan"),
-    "a report nowhere": ("drill", "cancel", "--json", "no/such/x.json"),
-    "a drill on another database": ("drill", "cancel", "--database", "mysql://h/x"),
     "a revision that there is not": ("db", "upgrade", "zzz"),
     "no revision": ("db", "upgrade", ""),
     "a relative revision": ("db", "upgrade", "+1"),
@@ -181,7 +172,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOSTLENS_URL", NOBODY)
     # The logging of this process belongs to all tests.
-    monkeypatch.setattr("service.logs.configure", lambda *_: None)
+    monkeypatch.setattr("service.runtime.logs.configure", lambda *_: None)
     return tmp_path
 
 
@@ -349,10 +340,19 @@ def test_closed_and_broken_streams_and_an_ascii_locale_are_no_reason_to_fail(tmp
     data = {"HOSTLENS_DATA_DIR": str(tmp_path / "database")}
     assert in_shell(tmp_path, "{} db upgrade 2>&- >&- <&-", **data).returncode == 0
     assert in_shell(tmp_path, "{} db check", **data).returncode == 0
-    for command in ("{} --help >&-", "{} --help 2>&-", "{} drill list | head -1", "{} --version 2>&1 >/dev/full | cat"):
+    for command in (
+        "{} --help >&-",
+        "{} --help 2>&-",
+        "{} db --help | head -1",
+        "{} --version 2>&1 >/dev/full | cat",
+    ):
         ended = in_shell(tmp_path, command, **data)
         assert b"Traceback" not in ended.stderr + ended.stdout, command
-    for command, code in (("{} drill list", 0), ("{} --help", 0), ("{} status 'gr\u00fcn' --url http://\u03b8:1", 2)):
+    for command, code in (
+        ("{} db --help", 0),
+        ("{} --help", 0),
+        ("{} status 'gr\u00fcn' --url http://\u03b8:1", 2),
+    ):
         ended = in_shell(tmp_path, command, **ASCII, **data)
         assert (ended.returncode, b"Traceback" in ended.stderr) == (code, False), (command, ended.stderr)
 

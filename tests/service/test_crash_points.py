@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from sqlalchemy import func, select
 
-from service.store.states import OPEN_STATES, RunState
+from service.domain.states import OPEN_STATES, RunState
 from service.store.tables import attempt, event, grid, idempotency, leader, result, run
 from tests.service.conftest import empty
 from tests.service.crashes import DEAD, OPERATIONS, Scene, Stores, die_at, stores

@@ -21,15 +21,15 @@ from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.loop import Dispatcher
 from service.dispatcher.pool import Pool, Worker
 from service.dispatcher.stalls import Stall, WorkerMemory
-from service.payload import ResultPayload
-from service.settings import Settings
+from service.domain.payload import ResultPayload
+from service.domain.states import GridState
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership, LeadershipLostError
 from service.store.leases import Lease
 from service.store.queue import RunQueue, Stored
-from service.store.states import GridState
-from service.worker import call_tasks
+from service.worker.tasks import call_tasks
 from tests.service.plans import body, planned
 
 

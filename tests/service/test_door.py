@@ -19,8 +19,8 @@ from typing import Any
 import httpx
 import pytest
 
-from service.drills.installation import eventually, free_port
 from service.store.migrate import upgrade
+from tests.drills.installation import eventually, free_port
 from tests.service.conftest import empty
 from tests.service.plans import BODY
 

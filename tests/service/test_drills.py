@@ -11,22 +11,21 @@ import psutil
 import pytest
 from typer.testing import CliRunner
 
-from service.cli import app
-from service.drills import postgres
-from service.drills.command import DRILLS
-from service.drills.drill import Ground, OccupiedError, ground
-from service.drills.kills import SchedulerKills, WorkerKills
-from service.drills.outages import DiskFull, PostgresKills, SqliteLock
-from service.drills.remote import TwoWorkers
-from service.drills.report import Report, quantile
-from service.drills.requests import Cancel, Idempotency
-from service.drills.rivals import Poison, StoppedWorker, TwoDispatchers
-from service.drills.scale import Overhead, Throughput
-from service.drills.stores import StoreAway
-from service.drills.volume import Listing, Submission
-from service.drills.workers import Lifetime, SilentWorker
 from service.store.database import Database
 from service.store.grids import GridStore
+from tests.drills import postgres
+from tests.drills.__main__ import DRILLS, app
+from tests.drills.drill import Ground, OccupiedError, ground
+from tests.drills.kills import SchedulerKills, WorkerKills
+from tests.drills.outages import DiskFull, PostgresKills, SqliteLock
+from tests.drills.remote import TwoWorkers
+from tests.drills.report import Report, quantile
+from tests.drills.rivals import Poison, StoppedWorker, TwoDispatchers
+from tests.drills.scale import Overhead, Throughput
+from tests.drills.stores import StoreAway
+from tests.drills.users import Cancel, Idempotency
+from tests.drills.volume import Listing, Submission
+from tests.drills.workers import Lifetime, SilentWorker
 from tests.service.plans import submit
 
 
@@ -100,25 +99,25 @@ def test_two_workers_apart_lose_nothing_and_are_measured_against_one(tmp_path: P
 
 def test_the_command_shows_writes_and_ends_as_the_claims_say(tmp_path: Path) -> None:
     run = CliRunner()
-    listed = run.invoke(app, ["drill", "list"])
+    listed = run.invoke(app, ["list"])
     assert listed.exit_code == 0
     assert all(name in listed.output for name in DRILLS)
     file = tmp_path / "report.json"
-    done = run.invoke(app, ["drill", "idempotency", "clients=5", "runs=3", "--json", str(file)])
+    done = run.invoke(app, ["idempotency", "clients=5", "runs=3", "--json", str(file)])
     assert done.exit_code == 0, done.output
     document = json.loads(file.read_text())
     assert document["holds"]
     assert {figure["name"]: figure["value"] for figure in document["figures"]}["grids"] == 1
     for wrong in (["nonsense"], ["cancel", "days=3"], ["cancel", "runs=many"]):
-        assert run.invoke(app, ["drill", *wrong]).exit_code == 2
-    assert run.invoke(app, ["drill", "cancel", "fast"]).exit_code == 2
+        assert run.invoke(app, [*wrong]).exit_code == 2
+    assert run.invoke(app, ["cancel", "fast"]).exit_code == 2
 
 
 @pytest.mark.postgres
 def test_a_drill_on_postgresql_brings_its_own_server_and_leaves_none(tmp_path: Path) -> None:
     before = len(list(Path(tempfile.gettempdir()).glob("hostlens-pg-*")))
     file = tmp_path / "report.json"
-    wanted = ["drill", "throughput", "runs=300", "--database", "postgresql", "--json", str(file)]
+    wanted = ["throughput", "runs=300", "--database", "postgresql", "--json", str(file)]
     CliRunner().invoke(app, wanted)
     document = json.loads(file.read_text())
     assert document["claims"][0] == {"text": "300 runs done, each stored once", "holds": True}
@@ -133,12 +132,12 @@ def test_a_drill_says_what_postgresql_lacks(monkeypatch: pytest.MonkeyPatch, tmp
     with monkeypatch.context() as without_driver:
         without_driver.setitem(sys.modules, "psycopg", None)
         for database in ("postgresql", "postgresql://nobody@/nothing"):
-            said = CliRunner().invoke(app, ["drill", "idempotency", "--database", database])
+            said = CliRunner().invoke(app, ["idempotency", "--database", database])
             assert (said.exit_code, "extra postgres" in said.output) == (2, True), said.output
     monkeypatch.delenv("PG_BIN", raising=False)
     monkeypatch.setattr(postgres, "_DEBIAN", tmp_path)
     monkeypatch.setattr(postgres, "find_spec", lambda _: None)
-    said = CliRunner().invoke(app, ["drill", "idempotency", "--database", "postgresql"])
+    said = CliRunner().invoke(app, ["idempotency", "--database", "postgresql"])
     assert (said.exit_code, "set PG_BIN" in said.output) == (2, True), said.output
 
 

@@ -13,14 +13,14 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import DataError, IntegrityError, OperationalError, ProgrammingError, StatementError
 
 from engine import engine_digest
-from service.answers import to_bytes
-from service.dispatcher.endings import OtherEngine, read_answer
-from service.payload import InvalidResultError, read_payload
+from service.dispatcher.outcomes import OtherEngine, read_answer
+from service.domain.payload import InvalidResultError, read_payload
+from service.domain.states import GridState
 from service.store.database import Database
 from service.store.leadership import Leadership
 from service.store.leases import Lease, Outcome, end_attempts, leased_by
 from service.store.queue import Failure, RunQueue
-from service.store.states import GridState
+from service.worker.answers import to_bytes
 from tests.service.plans import body, planned, result_of
 from tests.service.queue_model import Forgetful
 from tests.service.tasks import synthetic_payload

@@ -13,7 +13,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
-from service.settings import Settings
+from service.runtime.settings import Settings
 from tests.service.plans import body
 from tests.service.test_api import UNKNOWN_GRID, assert_problem, work
 

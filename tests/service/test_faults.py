@@ -19,8 +19,8 @@ from sqlalchemy import insert, text
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 
 from service.api.app import create_app
-from service.dispatcher.process import wait_to_lead
-from service.settings import Settings
+from service.dispatcher.dispatch import wait_to_lead
+from service.runtime.settings import Settings
 from service.store import faults
 from service.store.database import AWAY, Database
 from service.store.faults import (

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.dispatcher.process import ENDED
-from service.settings import Settings
+from service.dispatcher.dispatch import ENDED
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership, LeaderView

@@ -10,12 +10,12 @@ from sqlalchemy.exc import OperationalError
 
 from service.api import hub as hub_module
 from service.api.hub import Feed, FullError, Hub, News
-from service.identifiers import utc_now
-from service.schemas import EventPage
+from service.domain.identifiers import utc_now
+from service.domain.views import EventPage
 from service.store.database import Database
-from service.store.events import EventStore
 from service.store.grids import GridStore
 from service.store.leases import add_event
+from service.store.outbox import EventStore
 from tests.service.plans import submit
 
 

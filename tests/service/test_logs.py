@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service import logs
-from service.settings import LogSettings
+from service.runtime import logs
+from service.runtime.settings import LogSettings
 from tests.service.plans import body
 from tests.service.service_process import serving
 
@@ -98,7 +98,7 @@ def test_every_process_tells_of_a_run_with_its_grid_attempt_and_generation(tmp_p
 
     stored = found(process="dispatcher", event="stored", run=runs[0])
     assert [(line["grid"], line["attempt"], line["generation"]) for line in stored] == [(grid.id, 1, 1)]
-    failed = found(process="worker", logger="service.worker", run=runs[1])
+    failed = found(process="worker", logger="service.worker.tasks", run=runs[1])
     assert [line["attempt"] for line in failed] == [1, 2, 3]
     assert all(line["grid"] == grid.id and "the dice fell" in line["exception"] for line in failed)
     assert {line["code"] for line in found(process="dispatcher", run=runs[2], level="warning")} == {"invalid_result"}

@@ -9,7 +9,7 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 from engine import Host, Realization, simulate_realization, write_observation
-from service.cli import app
+from service.cli.app import app
 
 RUNNER = CliRunner()
 

@@ -13,9 +13,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import event, text
 
 from service.api.app import create_app
-from service.dispatcher.metrics import DispatcherMetrics, MeasuredQueue
-from service.settings import Settings
-from service.start import ConfigurationError
+from service.dispatcher.telemetry import DispatcherMetrics, MeasuredQueue
+from service.runtime.settings import Settings
+from service.runtime.start import ConfigurationError
 from service.store.database import Database
 from service.store.depth import QueueDepth
 from service.store.grids import GridStore

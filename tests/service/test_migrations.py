@@ -12,8 +12,8 @@ import pytest
 from sqlalchemy import Connection, inspect, text
 from typer.testing import CliRunner
 
-from service.cli import app
-from service.schemas import Summary
+from service.cli.app import app
+from service.domain.views import Summary
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership

@@ -10,10 +10,10 @@ from sqlalchemy import event, func, select, text
 
 from service.store.database import Database
 from service.store.depth import QueueDepth
-from service.store.events import EventStore
 from service.store.faults import DatabaseAwayError
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
+from service.store.outbox import EventStore
 from service.store.queue import RunQueue
 from service.store.tables import run
 from tests.service.plans import result_of, submit

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 
 from engine import read_observation, realization_from_dict, system_from_mapping
 from service.api.app import create_app
-from service.cli import app
-from service.pictures import named_or_read
-from service.settings import Settings
+from service.cli.app import app
+from service.cli.pictures import named_or_read
+from service.runtime.settings import Settings
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 OWN: dict[str, Any] = tomllib.loads((EXAMPLES / "my_system.toml").read_text(encoding="utf-8"))
@@ -203,7 +203,8 @@ def test_help_does_not_load_the_engine() -> None:
     import subprocess
 
     code = (
-        "import sys, service.cli; sys.exit(any(name.split('.')[0] in ('engine', 'matplotlib') for name in sys.modules))"
+        "import sys, service.cli.app; "
+        "sys.exit(any(name.split('.')[0] in ('engine', 'matplotlib') for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

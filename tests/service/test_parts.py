@@ -31,20 +31,20 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import Analysis
-from service.answers import LIMIT_BYTES, NotPlainError, read_answers, to_bytes
 from service.api.app import create_app
-from service.artefacts import ArtefactStore
-from service.cli import app
-from service.dispatcher.endings import OtherEngine, clean, read_answer, read_exception
-from service.dispatcher.holder import is_dead, own_name
-from service.dispatcher.plain import read_error
-from service.identifiers import utc_now
-from service.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
-from service.requests import AnalysisRequest
-from service.settings import Settings
+from service.cli.app import app
+from service.dispatcher.identity import is_dead, own_name
+from service.dispatcher.outcomes import OtherEngine, clean, read_answer, read_exception
+from service.dispatcher.pickle_guard import read_error
+from service.domain.identifiers import utc_now
+from service.domain.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
+from service.domain.requests import AnalysisRequest
+from service.runtime.settings import Settings
+from service.store.artefacts import ArtefactStore
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
-from service.worker import call_task, call_tasks, execute
+from service.worker.answers import LIMIT_BYTES, NotPlainError, read_answers, to_bytes
+from service.worker.tasks import call_task, call_tasks, execute
 from tests.service.plans import planned
 from tests.service.tasks import PNG, synthetic_payload
 
@@ -238,7 +238,7 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
 def test_a_worker_is_greeted_with_its_engine_one_thread_and_warm_kernels() -> None:
     """In a process of its own, as a worker started elsewhere is: without any of the variables that pin threads."""
     code = (
-        "from service.worker import greet; from service.answers import read_greeting; "
+        "from service.worker.tasks import greet; from service.worker.answers import read_greeting; "
         "said = read_greeting(greet('service.worker:execute')); "
         "print(said.engine, set(said.threads.values()), f'{said.warm_s:.1f}')"
     )
@@ -298,7 +298,7 @@ def test_an_exception_that_was_not_unpickled_is_told_by_the_text_that_is_in_it()
 def test_no_pickle_names_a_class_or_a_function_while_a_client_of_workers_is_open() -> None:
     code = """
 import os, pickle, sys
-from service.dispatcher.plain import only_plain_data
+from service.dispatcher.pickle_guard import only_plain_data
 class Harm:
     def __reduce__(self):
         return os.mkdir, (sys.argv[1],)

@@ -14,17 +14,17 @@ from sqlalchemy import Connection, func, select, text
 from sqlalchemy.event import listen, remove
 
 from service.api.app import create_app
-from service.requests import GridRequest, plan
-from service.settings import Settings
+from service.domain.requests import GridRequest, plan
+from service.domain.states import GridState
+from service.runtime.settings import Settings
 from service.store import pieces, settling, submission
 from service.store.database import Database
 from service.store.depth import QueueDepth
-from service.store.events import EventStore
 from service.store.grids import GridStore, NotFoundError
 from service.store.leadership import Leadership
 from service.store.leases import Outcome
+from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
-from service.store.states import GridState
 from service.store.submission import PlannedRun, SubmissionLostError
 from service.store.tables import grid, idempotency, run
 from service.store.upkeep import PATIENCE_S, Upkeep
@@ -540,7 +540,7 @@ def _is_scan(line: str) -> bool:
 
 def test_a_large_grid_is_counted_and_checked_without_being_planned(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[object] = []
-    monkeypatch.setattr("service.requests._planned", lambda one: made.append(one) or one)
+    monkeypatch.setattr("service.domain.requests._planned", lambda one: made.append(one) or one)
     free = {"systems": ["HE0435", "RXJ1131"], "l_eta": [0.8, 1.0], "mass_model": "recommended"}
     lists = {"n": [1 + i / 100 for i in range(100)], "r_eff": [0.3], "magnitude": [20 + i / 100 for i in range(100)]}
     counted = plan(GridRequest.model_validate({**free, **lists, "replicates": 2}), 100_000)

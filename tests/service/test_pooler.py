@@ -16,8 +16,8 @@ from sqlalchemy import func, select, text
 
 from service.api.app import create_app
 from service.client import ApiError
-from service.schemas import GridView
-from service.settings import Settings
+from service.domain.views import GridView
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.faults import AccessRefusedError, DatabaseAwayError
 from service.store.grids import GridStore

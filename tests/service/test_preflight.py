@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from service import preflight
-from service.settings import Settings, read_settings
-from service.start import ConfigurationError
-from service.supervisor import Supervisor
+from service.runtime import preflight
+from service.runtime.settings import Settings, read_settings
+from service.runtime.start import ConfigurationError
+from service.runtime.supervisor import Supervisor
 from tests.service.service_process import ROOT, free_port
 
 SECRET = "hunter2"  # noqa: S105 - what no message may repeat
@@ -237,7 +237,7 @@ def test_every_process_ends_by_a_wrong_setting_with_one_line_and_2(command: tupl
     assert [line.split(":")[:2] for line in ended.stderr.splitlines()] == [["hostlens", " HOSTLENS_WORKER_MEMORY"]]
 
 
-@pytest.mark.parametrize("first", ["engine.home", "service.start"])
+@pytest.mark.parametrize("first", ["engine.home", "service.runtime.start"])
 def test_a_home_that_may_not_be_entered_is_taken_for_none(first: str, tmp_path: Path) -> None:
     """As ``su`` and ``sudo`` leave it: the home of whoever called. Astropy cannot be imported with such a one."""
     program = (
@@ -248,7 +248,7 @@ def test_a_home_that_may_not_be_entered_is_taken_for_none(first: str, tmp_path: 
         "    return real(path, *rest, **options)\n"
         "os.stat = stat\n"
         f"import {first}\n"
-        "if 'service' in sys.modules:\n    sys.modules['service.start'].begin()\n"
+        "if 'service' in sys.modules:\n    sys.modules['service.runtime.start'].begin()\n"
         "os.stat = real; print(os.environ['HOME'])"
     )
     ended = subprocess.run(
@@ -270,7 +270,7 @@ def test_slurm_without_its_command_is_told_before_a_start(tmp_path: Path, monkey
 def test_the_check_of_semaphores_leaves_no_process(tmp_path: Path) -> None:
     """A process that watches over them would outlive by a moment whoever asked for it."""
     program = (
-        "import psutil; from service import preflight; from service.settings import Settings\n"
+        "import psutil; from service.runtime import preflight; from service.runtime.settings import Settings\n"
         "preflight.require_cluster(Settings()); print(psutil.Process().children())"
     )
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},

@@ -15,20 +15,20 @@ from sqlalchemy import func, select
 from typer.testing import CliRunner
 
 from service.api.app import create_app
-from service.artefacts import ArtefactStore
-from service.cli import app
-from service.orphans import FOREIGN, REFERRED, YOUNG, Orphans, oldest_kept
-from service.pruning import read_age
-from service.settings import Settings
+from service.cli.app import app
+from service.cli.pruning import read_age
+from service.domain.states import RunState
+from service.runtime.settings import Settings
 from service.store import retention
+from service.store.artefacts import ArtefactStore
 from service.store.database import Database
-from service.store.events import EventStore
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.leases import Outcome
+from service.store.orphans import FOREIGN, REFERRED, YOUNG, Orphans, oldest_kept
+from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
 from service.store.retention import NEWEST, OPEN, YOUNGER, Retention, Share
-from service.store.states import RunState
 from service.store.tables import attempt, event, idempotency, result
 from tests.service.conftest import Clock
 from tests.service.plans import body, planned, result_of

@@ -18,8 +18,8 @@ from schemathesis.specs.openapi.checks import (
 )
 
 from service.api.app import create_app
-from service.artefacts import ArtefactStore
-from service.settings import Settings
+from service.runtime.settings import Settings
+from service.store.artefacts import ArtefactStore
 from service.store.database import Database
 from service.store.leadership import Leadership
 from service.store.leases import Outcome

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from service.drills.installation import free_port
+from tests.drills.installation import free_port
 from tests.service.service_process import ROOT, eventually
 
 _MARK = "HOSTLENS_DRILL_MARK"
@@ -46,7 +46,7 @@ def environment(folder: Path, mark: str) -> dict[str, str]:
         "PYTHONPATH": str(ROOT),
         "HOSTLENS_DATA_DIR": str(folder / "data"),
         "HOSTLENS_PORT": str(free_port()),
-        "HOSTLENS_TASK": "service.drills.tasks:brief",
+        "HOSTLENS_TASK": "tests.drills.tasks:brief",
     }
 
 
@@ -107,7 +107,7 @@ def test_a_service_that_is_stopped_at_any_moment_of_its_start_ends_with_0_and_le
                 each.kill()
 
 
-@pytest.mark.parametrize("command", [("demo",), ("drill", "cancel", "runs=1000"), ("simulate", "HE0435")])
+@pytest.mark.parametrize("command", [("demo",), ("simulate", "HE0435")])
 def test_a_command_that_is_stopped_says_that_its_work_is_not_done_and_leaves_nobody(
     command: tuple[str, ...], tmp_path: Path
 ) -> None:

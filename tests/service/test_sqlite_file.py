@@ -16,7 +16,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import func, select, text
 
 from service.api.app import create_app
-from service.settings import Settings
+from service.runtime.settings import Settings
 from service.store import sqlite_file
 from service.store.database import Database
 from service.store.faults import DatabaseAwayError

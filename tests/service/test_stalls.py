@@ -84,7 +84,7 @@ def test_the_process_that_holds_the_local_cluster_is_killed_and_nobody_is_charge
     with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.5") as service:
         grid = service.client.submit(body(20))
         eventually(lambda: service.client.status(grid.id).counts.done >= 2, 60, "progress")
-        dispatcher, host = service.child("service.dispatcher"), service.child("service.dispatcher.host")
+        dispatcher, host = service.child("service.dispatcher"), service.child("service.dispatcher.cluster_process")
         assert host is not None
         host.kill()
         assert service.client.wait(grid.id, timeout_s=120).counts.done == 20

@@ -8,10 +8,11 @@ import pytest
 from sqlalchemy import select, update
 from sqlalchemy.exc import IntegrityError
 
+from service.domain.states import OPEN_STATES, TERMINAL_STATES, TRANSITIONS, RunState
 from service.store.database import Database
 from service.store.grids import GridStore
-from service.store.states import OPEN_STATES, TERMINAL_STATES, TRANSITIONS, RunState, move
 from service.store.tables import run
+from service.store.transitions import move
 from tests.service.plans import submit
 
 

@@ -10,9 +10,9 @@ from fastapi.testclient import TestClient
 from sqlalchemy import RowMapping, select
 
 from service.api.app import create_app
-from service.payload import ESTIMATES
-from service.requests import GridRequest, plan
-from service.schemas import (
+from service.domain.payload import ESTIMATES
+from service.domain.requests import GridRequest, plan
+from service.domain.views import (
     GridView,
     OverallEstimate,
     OverallValue,
@@ -21,7 +21,7 @@ from service.schemas import (
     SummaryRow,
     SummaryValue,
 )
-from service.settings import Settings
+from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership

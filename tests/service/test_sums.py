@@ -9,16 +9,16 @@ import pytest
 from rich.console import Console
 from sqlalchemy import func, select
 
-from service.payload import ESTIMATES
-from service.requests import GridRequest, plan
-from service.schemas import Summary
+from service.cli.formatting import summary_table
+from service.domain.payload import ESTIMATES
+from service.domain.requests import GridRequest, plan
+from service.domain.views import Summary
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import downgrade, upgrade
 from service.store.queue import RunQueue
 from service.store.tables import GROUP_COLUMNS, SUMMED, input_sum, result
-from service.tables import summary_table
 from tests.service.plans import result_of
 
 BODY = {"preset": "h0licow-vi/HE0435", "n": [2, 4], "l_eta": [1.0], "r_eff": [0.39], "replicates": 3}

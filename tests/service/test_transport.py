@@ -16,11 +16,11 @@ import httpx
 import pytest
 from sqlalchemy import text
 
-from service.drills.installation import Installation, eventually
-from service.identifiers import utc_now
+from service.domain.identifiers import utc_now
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leases import add_event
+from tests.drills.installation import Installation, eventually
 from tests.service.conftest import empty
 from tests.service.plans import body, submit
 

@@ -1,0 +1,416 @@
+"""The command ``hostlens``."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperGroup
+from typer.exceptions import TyperException
+
+from service import VERSION
+from service.cli.measuring import measure
+from service.cli.pictures import COMMANDS, named_or_read
+from service.cli.request_file import read_request
+from service.runtime.start import CONFIGURATION, ConfigurationError
+
+if TYPE_CHECKING:
+    # What a command loads it loads itself: help and mistakes are told at once.
+    from rich.console import Console
+
+    from service.client import Client
+    from service.domain.views import GridView
+    from service.runtime.settings import Settings
+
+_ARGUMENTS_WANTED = "NoArgsIsHelpError"
+
+
+class _FailedError(RuntimeError):
+    """What was asked for could not be done."""
+
+
+class _CommandLine(TyperGroup):
+    """Where every refusal becomes one line on standard error, and a mistake of ours stays a traceback.
+
+    The exit code is 2 where something else has to be asked for, 1 where the same may succeed another time.
+    """
+
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run a command; SystemExit in any case."""
+        try:
+            code = super().main(*args, **{**extra, "standalone_mode": False})
+        except TyperException as error:
+            if type(error).__name__ == _ARGUMENTS_WANTED:
+                typer.echo(error.format_message())
+                raise SystemExit(CONFIGURATION) from None
+            self._refuse(error.format_message(), error.exit_code)
+        except ConfigurationError as error:
+            self._refuse(str(error), CONFIGURATION)
+        except (_FailedError, OSError, typer.Abort) as error:
+            self._refuse(str(error) or "given up", 1)
+        raise SystemExit(code if isinstance(code, int) else 0)
+
+    def _refuse(self, message: str, code: int) -> NoReturn:
+        typer.echo(f"hostlens: {' '.join(message.split())}", err=True)
+        raise SystemExit(code) from None
+
+
+app = typer.Typer(
+    name="hostlens",
+    cls=_CommandLine,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
+)
+database = typer.Typer(no_args_is_help=True, help="The database.")
+app.add_typer(database, name="db")
+for command in (*COMMANDS, measure):
+    app.command()(command)
+
+Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]
+Floats = Annotated[list[float] | None, typer.Option()]
+
+
+def _console() -> Console:
+    from rich.console import Console  # noqa: PLC0415 - as all that a command needs
+
+    return Console()
+
+
+def _settings(**changes: Any) -> Settings:
+    from service.runtime.settings import Settings, read_settings  # noqa: PLC0415 - as above
+
+    return read_settings(Settings, **changes)
+
+
+@contextmanager
+def _client(url: str | None) -> Iterator[Client]:
+    """A client of the service; where it is not served, the command ends with a line."""
+    import httpx  # noqa: PLC0415 - as above
+
+    from service.client import Client, ClientError, RequestError  # noqa: PLC0415 - as above
+
+    try:
+        with Client(_settings().url if url is None else url) as client:
+            yield client
+    except RequestError as error:
+        raise ConfigurationError(str(error)) from error
+    except ClientError as error:
+        raise _FailedError(str(error)) from error
+    except httpx.RequestError as error:
+        raise _FailedError(f"the service does not answer: {error}") from error
+
+
+def _tell(grid: GridView) -> None:
+    from service.cli.formatting import grid_line  # noqa: PLC0415 - as above
+
+    typer.echo(grid_line(grid))
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(VERSION)
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True)] = False,
+) -> None:
+    """Simulate lensed quasars, reconstruct their hosts, and keep the biases."""
+
+
+@app.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Where the API listens")] = None,
+    port: Annotated[int | None, typer.Option(help="Port of the API")] = None,
+    workers: Annotated[int | None, typer.Option(help="Worker processes")] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of database and artefacts")] = None,
+) -> None:
+    """Run the service (API, dispatcher, workers) until Ctrl-C."""
+    from service.runtime import logs  # noqa: PLC0415 - alembic takes a while, and status needs none
+    from service.runtime.supervisor import serve as supervise  # noqa: PLC0415 - as above
+
+    settings = _settings(host=host, port=port, workers=workers, data_dir=data_dir)
+    logs.configure(settings, "supervisor")
+    with _migrating():
+        code = supervise(settings, lambda: typer.echo(f"hostlens serves {settings.url}; Ctrl-C ends it"))
+    raise typer.Exit(code)
+
+
+@app.command()
+def api() -> None:
+    """Run one API process alone."""
+    from service.api.serve import serve as serve_api  # noqa: PLC0415 - loads the engine
+
+    serve_api(_settings())
+
+
+@app.command()
+def dispatcher() -> None:
+    """Run one dispatcher process alone; a second one stands by."""
+    from service.dispatcher.dispatch import dispatch  # noqa: PLC0415 - loads Dask
+
+    raise typer.Exit(dispatch(_settings()))
+
+
+@app.command()
+def scheduler(
+    host: Annotated[str, typer.Option(help="Where it listens; whoever reaches it can run code on the workers")],
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port for dispatcher and workers")] = 8786,
+    health: Annotated[str, typer.Option(help="Address of /health and /metrics")] = "127.0.0.1:8787",
+) -> None:
+    """Run a Dask scheduler for workers on several machines."""
+    from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
+
+    settings = _settings()
+    standalone.become(settings, standalone.scheduler_arguments(settings, host, port, health))
+
+
+@app.command()
+def worker(
+    address: Annotated[str, typer.Argument(envvar="HOSTLENS_SCHEDULER_ADDRESS", help="Of the scheduler")],
+    workers: Annotated[int, typer.Option(min=1, help="Processes, of one thread each")] = 1,
+    health: Annotated[str, typer.Option(help="Address of /health and /metrics of the first")] = "127.0.0.1:0",
+) -> None:
+    """Run workers for a scheduler, here or on another machine."""
+    from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
+
+    settings = _settings(scheduler_address=address, cluster="address")
+    standalone.become(settings, standalone.worker_arguments(settings, address, workers, health))
+
+
+@app.command()
+def demo(
+    data_dir: Annotated[Path, typer.Option(help="Folder of the demo's database and figures")] = Path("var/demo"),
+) -> None:
+    """Four runs of HE0435-1223 through the whole system; exit code 0 only if all four were stored."""
+    from service.cli.demo import demo as run_demo  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    raise typer.Exit(run_demo(_settings(data_dir=data_dir), _console()))
+
+
+@app.command()
+def submit(
+    preset: Annotated[str | None, typer.Option(help="As h0licow-vi/HE0435")] = None,
+    system: Annotated[
+        list[str] | None, typer.Option(help="A name, or a TOML or JSON file; may be repeated, like the values below")
+    ] = None,
+    n: Floats = None,
+    r_eff: Floats = None,
+    magnitude: Floats = None,
+    l_eta: Floats = None,
+    seed: Annotated[int | None, typer.Option()] = None,
+    replicates: Annotated[int | None, typer.Option()] = None,
+    name: Annotated[str | None, typer.Option(help="For people")] = None,
+    file: Annotated[Path | None, typer.Option(help="A JSON body; options override it")] = None,
+    key: Annotated[str | None, typer.Option(help="Idempotency key")] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
+    url: Url = None,
+) -> None:
+    """Submit a grid."""
+    request = {} if file is None else read_request(file)
+    options = {
+        "preset": preset, "systems": [named_or_read(entry) for entry in system or []],
+        "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed,
+        "replicates": replicates, "name": name,
+    }  # fmt: skip
+    request |= {option: value for option, value in options.items() if value not in (None, [])}
+    with _client(url) as client:
+        grid = client.submit(request, key)
+        typer.echo(grid.id)
+        if watch:
+            _watch(client, grid.id)
+
+
+@app.command()
+def status(
+    grid: Annotated[str | None, typer.Argument(help="A grid; the newest ones without")] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
+    runs: Annotated[bool, typer.Option("--runs", help="List the runs")] = False,
+    url: Url = None,
+) -> None:
+    """How far grids are."""
+    with _client(url) as client:
+        if grid is None:
+            for item in client.grids().items:
+                _tell(item)
+        elif watch:
+            _watch(client, grid)
+        elif runs:
+            from service.cli.formatting import runs_table  # noqa: PLC0415 - as above
+
+            _console().print(runs_table(client.runs(grid)))
+        else:
+            _tell(client.status(grid))
+
+
+@app.command()
+def results(
+    grid: Annotated[str, typer.Argument()],
+    as_json: Annotated[bool, typer.Option("--json", help="The summary as the API gives it")] = False,
+    url: Url = None,
+) -> None:
+    """Recovered values and biases of a grid."""
+    with _client(url) as client:
+        summary = client.summary(grid)
+        if as_json:
+            typer.echo(summary.model_dump_json(indent=2))
+        else:
+            from service.cli.formatting import summary_table  # noqa: PLC0415 - as above
+
+            _console().print(summary_table(summary))
+
+
+@app.command()
+def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Cancel a grid."""
+    with _client(url) as client:
+        _tell(client.cancel(grid))
+
+
+@app.command()
+def pause(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Start no further run of a grid for now; running ones go on to their end."""
+    with _client(url) as client:
+        _tell(client.pause(grid))
+
+
+@app.command()
+def resume(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Go on with a paused grid."""
+    with _client(url) as client:
+        _tell(client.resume(grid))
+
+
+@app.command()
+def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
+    """Queue again what failed, was quarantined or was cancelled."""
+    with _client(url) as client:
+        _tell(client.retry(grid))
+
+
+@database.command("upgrade")
+def db_upgrade(revision: Annotated[str, typer.Argument(help="Which; the newest without")] = "head") -> None:
+    """Bring the database to a newer schema, by default the newest; may be repeated, by several at once."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    _require_revision(revision, "head")
+    settings = _database_settings()
+    with _migrating():
+        migrate.upgrade(settings.database, revision)
+    typer.echo(f"the database is at revision {migrate.current(settings.database)}")
+
+
+@database.command("downgrade")
+def db_downgrade(
+    revision: Annotated[str, typer.Argument(help="Which, or base: no tables at all")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask")] = False,
+) -> None:
+    """Take the database back to an older schema; what only the newer one has is lost. Stop the service first."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    _require_revision(revision, "base")
+    settings = _database_settings()
+    if not yes:
+        typer.confirm(f"take the database back to revision {revision}?", abort=True)
+    with _migrating():
+        migrate.downgrade(settings.database, revision)
+    typer.echo(f"the database is at revision {migrate.current(settings.database) or 'base'}")
+
+
+@database.command("current")
+def db_current() -> None:
+    """Revision of the database, and the one that this hostlens expects."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    with _migrating():
+        found = migrate.current(_database_settings().database)
+    typer.echo(f"database {found or 'base'}, code {migrate.revisions()[-1]}")
+
+
+@database.command("check")
+def db_check() -> None:
+    """Whether the database is what this hostlens expects; exit code 1 where it is not."""
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    with _migrating():
+        found = migrate.differences(_database_settings().database)
+    if found is not None:
+        raise _FailedError(found)
+    typer.echo("the database is what the code expects")
+
+
+def _require_revision(revision: str, other: str) -> None:
+    from service.store import migrate  # noqa: PLC0415 - alembic takes a while, and status needs none
+
+    allowed = (*migrate.revisions(), other)
+    if revision not in allowed:
+        raise typer.BadParameter(f"there is no revision {revision!r}: allowed is one of {', '.join(allowed)}")
+
+
+def _database_settings() -> Settings:
+    """The settings, with a database that can be used as far as this machine is concerned."""
+    from service.runtime import preflight  # noqa: PLC0415 - loads SQLAlchemy
+
+    settings = _settings()
+    if settings.database_url is None:
+        preflight.require_data(settings)
+    preflight.require_database(settings)
+    return settings
+
+
+@database.command("prune")
+def db_prune(
+    older_than: Annotated[str, typer.Option("--older-than", metavar="AGE", help="As 90d, 12h or 4w")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Show what would go, and delete nothing")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask")] = False,
+) -> None:
+    """Delete old events, attempts and keys of grids that have ended, and files that no result refers to.
+
+    First it shows what would go, and what stays and why. The service may run meanwhile.
+    """
+    from service.cli import pruning  # noqa: PLC0415 - loads fsspec
+    from service.runtime import preflight  # noqa: PLC0415 - loads fsspec
+
+    try:
+        age = pruning.read_age(older_than)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--older-than") from error
+    settings = _database_settings()
+    preflight.require_artefacts(settings)
+    with _migrating():
+        raise typer.Exit(pruning.prune(settings, age, _console(), dry_run=dry_run, ask=not yes))
+
+
+@contextmanager
+def _migrating() -> Iterator[None]:
+    """Where a refusal of the database or of a migration ends the command with a line instead of a traceback."""
+    from sqlalchemy.exc import DBAPIError  # noqa: PLC0415 - as alembic
+
+    from service.store.faults import AWAY, one_line  # noqa: PLC0415 - as above
+    from service.store.migrate import MigrationError  # noqa: PLC0415 - as above
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    try:
+        yield
+    except MigrationError as error:
+        raise _FailedError(str(error)) from error
+    except DBAPIError as error:
+        told = error if isinstance(error, AWAY) else one_line(error.orig or error)
+        raise _FailedError(f"the database refuses: {told}") from error
+
+
+def _watch(client: Client, grid_id: str) -> None:
+    from service.cli.watch import progress  # noqa: PLC0415 - as above
+
+    with progress(_console()) as show:
+        grid = client.wait(grid_id, show)
+    _tell(grid)
+    if grid.counts.done != grid.n_runs:
+        raise typer.Exit(1)

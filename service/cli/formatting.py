@@ -1,0 +1,92 @@
+"""Tables for people: what the CLI and the demo print."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rich.table import Table
+
+from service.domain.payload import EstimateName
+from service.domain.views import GridView, RunView, Summary, SummaryEstimate, SummaryValue
+
+_INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
+ROWS: tuple[tuple[EstimateName, str, str], ...] = (
+    ("image_wide", "magnitude", "magnitude"),
+    ("image_wide", "r_eff", "R_eff"),
+    ("image_wide", "n", "n"),
+    ("projected_wide", "magnitude", "magnitude (projected)"),
+    ("covariance_wide", "magnitude", "magnitude (covariance)"),
+    ("paper_free", "magnitude", "magnitude (paper)"),
+    ("paper_fixed", "magnitude", "  n fixed"),
+    ("paper_free", "r_eff", "R_eff (paper)"),
+    ("paper_free", "n", "n (paper)"),
+)
+"""What is shown of each input: by ``image`` with n in 0.3-8 where nothing is said, by ``paper`` with n in 1-4."""
+
+
+def value_of(estimate: SummaryEstimate, quantity: str) -> SummaryValue:
+    """One quantity of an estimate by its name."""
+    value = getattr(estimate, quantity)
+    if not isinstance(value, SummaryValue):
+        raise KeyError(quantity)
+    return value
+
+
+def summary_table(summary: Summary) -> Table:
+    """Input against recovered, a few lines for each input; narrow enough for eighty columns."""
+    table = Table(title=f"Grid {summary.grid_id}\n{summary.n_stored} of {summary.n_runs} runs stored")
+    table.add_column("input")
+    table.add_column("quantity")
+    for title in ("true", "recovered +- sd", "bias"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for row in summary.rows:
+        named = [f"{row.input['system']} ({row.n_runs} run{'s' * (row.n_runs > 1)})"]
+        named += [f"{title} = {row.input[name]:g}" for name, title in _INPUT]
+        named += [""] * (len(ROWS) - len(named))
+        for place, (cell, (estimate, quantity, title)) in enumerate(zip(named, ROWS, strict=True)):
+            last = place == len(ROWS) - 1
+            found = row.estimates[estimate]
+            if found is None:
+                table.add_row(cell, title, "", "no estimate", "", end_section=last)
+                continue
+            value = value_of(found, quantity)
+            true, bias = _number(value.input, "{:g}"), _number(value.bias, "{:+.3f}")
+            table.add_row(cell, title, true, f"{value.mean:.3f} +- {value.sd:.3f}", bias, end_section=last)
+    table.caption = (
+        "bias: recovered minus true; sd: spread of the draws of a run; by the image estimator where none is named; "
+        "n in 1-4 for paper"
+    )
+    return table
+
+
+def _number(value: float | None, form: str) -> str:
+    return "" if value is None else form.format(value)
+
+
+def runs_table(runs: Iterable[RunView]) -> Table:
+    """Runs with their states."""
+    table = Table("run", "label", "state", "attempt", "error")
+    for run in runs:
+        table.add_row(run.id, run.label, run.state, str(run.attempt), "" if run.error is None else run.error.code)
+    return table
+
+
+def grid_line(grid: GridView) -> str:
+    """One line on how far a grid is."""
+    parts = [f"{grid.id} {grid.state}: {grid.counts.done}/{grid.n_runs} stored"]
+    for state in ("leased", "paused", "failed", "quarantined", "cancelled"):
+        number = getattr(grid.counts, state)
+        if number:
+            parts.append(f"{number} {'running' if state == 'leased' else state}")
+    if grid.rate_per_s:
+        parts.append(f"{60 * grid.rate_per_s:.2g} runs/min")
+    if grid.eta_seconds and grid.finished_at is None:
+        parts.append(f"{duration(grid.eta_seconds)} left")
+    return ", ".join(parts)
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people."""
+    whole = round(seconds)
+    hours, minutes = divmod(whole // 60, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {whole % 60:02d} s" if minutes else f"{whole} s"

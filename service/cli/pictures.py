@@ -1,0 +1,280 @@
+"""The commands that simulate without a service: one realization, a system's 48, the eight systems, an inversion."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from service.cli.outputs import PICTURES, require_file, require_folder
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from engine import Camera, LensSystem, Realization, Simulation
+
+# The engine and matplotlib take seconds to load: only a command that runs pays, not its --help.
+
+_FILES = (".toml", ".json")
+_DPI = 96
+_GALLERY_RUN = 17
+_N, _L_ETA = 2.0, 1.0
+
+Out = Annotated[Path, typer.Option(help="Folder of the files; made where it is missing")]
+NoiseOption = Annotated[str, typer.Option(help="author (the paper's scripts) or handbook")]
+MassOption = Annotated[str, typer.Option(help="recommended, or an alternative of the system, as epl_noshear")]
+CameraOption = Annotated[str | None, typer.Option(help="Instead of the system's: a name, or a TOML or JSON file")]
+SeedOption = Annotated[int, typer.Option(min=0)]
+
+
+@dataclass(frozen=True)
+class HostOptions:
+    """The host and slope as the command line gives them; None where the catalogue has to say."""
+
+    n: float
+    r_eff: float | None
+    magnitude: float | None
+    l_eta: float
+
+
+def simulate(
+    system: Annotated[str, typer.Argument(help="A system of the catalogue, as HE0435, or a TOML or JSON file")],
+    n: Annotated[float | None, typer.Option(help="Sersic index of the host; 2 where not given")] = None,
+    r_eff: Annotated[float | None, typer.Option(help="arcsec; the paper's smaller one where not given")] = None,
+    magnitude: Annotated[float | None, typer.Option(help="AB; the paper's second brightest where not given")] = None,
+    l_eta: Annotated[float | None, typer.Option(help="Slope of the lens, gamma' - 1; 1 where not given")] = None,
+    seed: SeedOption = 0,
+    noise_level: NoiseOption = "author",
+    mass_model: MassOption = "recommended",
+    camera: CameraOption = None,
+    defocus_nm: Annotated[float, typer.Option(help="Focus error of the telescope, nm rms of wavefront")] = 0.0,
+    jitter: Annotated[float, typer.Option(min=0.0, help="Pointing jitter, arcsec rms an axis")] = 0.0,
+    out: Out = Path(),
+    all_runs: Annotated[bool, typer.Option("--all", help="The paper's 48 instead, as a montage")] = False,
+) -> None:
+    """Simulate one realization: a FITS file, and a picture of its steps as in the paper's Fig. 1."""
+    common = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
+    if all_runs:
+        if any(value is not None for value in (n, r_eff, magnitude, l_eta)) or defocus_nm or jitter:
+            raise typer.BadParameter("--all has the hosts, slopes and optics of the paper: leave out --n, --r-eff, ...")
+        montage(system, **common, camera=camera, out=out)  # type: ignore[arg-type]
+        return
+    optics = {"defocus_nm": defocus_nm, "jitter": jitter} if defocus_nm or jitter else None
+    with refusals():
+        realization = _realization(
+            system,
+            HostOptions(_N if n is None else n, r_eff, magnitude, _L_ETA if l_eta is None else l_eta),
+            camera,
+            common | {"optics": optics},
+        )
+        _write_one(realization, out)
+
+
+def montage(
+    system: Annotated[str, typer.Argument(help="A system of the catalogue")],
+    seed: SeedOption = 0,
+    noise_level: NoiseOption = "author",
+    mass_model: MassOption = "recommended",
+    camera: CameraOption = None,
+    out: Out = Path(),
+) -> None:
+    """Picture the 48 realizations of a system, numbered as in the paper's Table 3."""
+    with refusals():
+        from engine import Grid, expand, simulate_realization  # noqa: PLC0415
+        from engine.figures import montage_figure  # noqa: PLC0415
+
+        document = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
+        runs = expand(_validated(Grid, preset=f"h0licow-vi/{system}", camera=_camera(camera), **document))
+        require_folder(out)
+        observations = []
+        with _progress(f"simulating {system}", len(runs)) as advance:
+            for run in runs:
+                observations.append(simulate_realization(run.realization).observation)
+                advance()
+        _save(montage_figure(runs, observations), out / f"{system}_montage.png")
+
+
+def gallery(
+    paper_run: Annotated[int, typer.Option("--run", min=1, max=48, help="Of the paper's Table 3")] = _GALLERY_RUN,
+    seed: SeedOption = 0,
+    noise_level: NoiseOption = "author",
+    out: Out = Path(),
+) -> None:
+    """Picture the eight systems side by side, each with its lensed host alone."""
+    with refusals():
+        from engine import Grid, expand, simulate_realization  # noqa: PLC0415
+        from engine.figures import gallery_figure  # noqa: PLC0415
+
+        grid = _validated(Grid, preset="h0licow-vi", seed=seed, noise_level=noise_level)
+        runs = [run for run in expand(grid) if run.paper_run == paper_run]
+        require_folder(out)
+        simulations: list[Simulation] = []
+        with _progress("simulating the eight systems", len(runs)) as advance:
+            for run in runs:
+                simulations.append(simulate_realization(run.realization))
+                advance()
+        _save(gallery_figure(simulations), out / "gallery.png")
+
+
+def inversion(
+    system: Annotated[str, typer.Argument(help="A system of the catalogue, as HE0435, or a TOML or JSON file")],
+    n: Annotated[float, typer.Option(help="Sersic index of the host")] = _N,
+    r_eff: Annotated[float | None, typer.Option(help="arcsec; the paper's smaller one where not given")] = None,
+    magnitude: Annotated[float | None, typer.Option(help="AB; the paper's second brightest where not given")] = None,
+    l_eta: Annotated[float, typer.Option(help="Slope of the lens, gamma' - 1")] = _L_ETA,
+    profile: Annotated[str, typer.Option(help="draft, standard, reference or paper")] = "standard",
+    source_pixels: Annotated[int | None, typer.Option(help="Source pixels along a side; the profile's without")] = None,
+    seed: SeedOption = 0,
+    noise_level: NoiseOption = "author",
+    mass_model: MassOption = "recommended",
+    camera: CameraOption = None,
+    out: Annotated[Path | None, typer.Option(help="The picture; SYSTEM_inversion.png without")] = None,
+) -> None:
+    """Picture one inversion: data, model, residual, source and its resolution, ln Z along each lens parameter."""
+    grid = {} if source_pixels is None else {"source_pixels": (source_pixels, source_pixels)}
+    common = {
+        "seed": seed, "noise_level": noise_level, "mass_model": mass_model, "analysis": {"profile": profile, **grid},
+    }  # fmt: skip
+    with refusals():
+        from engine import inspect_simulation, simulate_realization  # noqa: PLC0415
+        from engine.figures import inversion_figure  # noqa: PLC0415
+
+        realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
+        path = out or Path(f"{_as_file(realization.system_name)}_inversion.png")
+        require_folder(path.parent)
+        require_file(path, PICTURES)
+        with _progress(f"inverting {realization.system_name}", 3) as advance:
+            simulation = simulate_realization(realization)
+            advance()
+            view = inspect_simulation(simulation, realization.analysis)
+            advance()
+            figure = inversion_figure(view)
+            advance()
+        _save(figure, path)
+
+
+COMMANDS = (simulate, montage, gallery, inversion)
+
+
+def _realization(system: str, host: HostOptions, camera: str | None, common: dict[str, Any]) -> Realization:
+    from engine import realization_from_dict  # noqa: PLC0415
+
+    chosen: str | LensSystem = system
+    values = {"r_eff": host.r_eff, "magnitude": host.magnitude}
+    if system.lower().endswith(_FILES):
+        from engine import read_system  # noqa: PLC0415
+
+        chosen = read_system(system)
+        missing = [name for name, value in values.items() if value is None]
+        if missing:
+            options = " and ".join(f"--{name.replace('_', '-')}" for name in missing)
+            raise typer.BadParameter(f"a system of your own has no default host: give {options}")
+    else:
+        values = _paper_values(system) | {name: value for name, value in values.items() if value is not None}
+    return realization_from_dict(
+        {"system": chosen, "l_eta": host.l_eta, "host": {"n": host.n, **values}, "camera": _camera(camera), **common}
+    )
+
+
+def _paper_values(system: str) -> dict[str, float | None]:
+    """The smaller r_eff and the second brightest magnitude of the system in the paper's Table 2."""
+    from engine import Grid, expand, load_system  # noqa: PLC0415
+
+    load_system(system)  # refuses an unknown one by this name, not as a preset
+    hosts = [run.realization.host for run in expand(Grid(preset=f"h0licow-vi/{system}"))]
+    return {"r_eff": min(host.r_eff for host in hosts), "magnitude": sorted({host.magnitude for host in hosts})[1]}
+
+
+def named_or_read(system: str) -> str | dict[str, Any]:
+    """A system for a request: the name as it is, a file as the table that it holds."""
+    if not system.lower().endswith(_FILES):
+        return system
+    with refusals():
+        from engine import read_mapping  # noqa: PLC0415
+
+        return read_mapping(system)
+
+
+def _camera(choice: str | None) -> str | Camera | None:
+    if choice is None or not choice.lower().endswith(_FILES):
+        return choice
+    from engine import read_camera  # noqa: PLC0415
+
+    return read_camera(choice)
+
+
+def _validated(kind: Any, **fields: Any) -> Any:
+    """An object of the engine; pydantic's complaint becomes a SpecError that names the field."""
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from engine import spec_error  # noqa: PLC0415
+
+    try:
+        return kind(**fields)
+    except ValidationError as error:
+        raise spec_error(error) from error
+
+
+def _write_one(realization: Realization, out: Path) -> None:
+    from engine import simulate_realization, write_observation  # noqa: PLC0415
+    from engine.figures import simulation_figure  # noqa: PLC0415
+
+    host = realization.host
+    # The digest in the name: another seed or camera is another file, and the same command writes the same one again.
+    stem = (
+        f"{_as_file(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
+        f"_{realization.digest[:8]}"
+    )
+    require_folder(out)
+    with _progress(f"simulating {realization.system_name}", 3) as advance:
+        simulation = simulate_realization(realization)
+        advance()
+        write_observation(out / f"{stem}.fits", simulation.observation, overwrite=True)
+        advance()
+        figure = simulation_figure(simulation)
+        advance()
+    typer.echo(out / f"{stem}.fits")
+    _save(figure, out / f"{stem}.png")
+    record = simulation.observation.provenance
+    if record["NOISE"] != record["NOISEREQ"]:
+        typer.echo(f"the camera has no noise level {record['NOISEREQ']!r}: {record['NOISE']!r} was used", err=True)
+
+
+def _as_file(name: str) -> str:
+    """The name of a system of anybody's, without what a file cannot be called."""
+    return re.sub(r"[^\w.+-]", "_", name)[:80]
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=_DPI)
+    typer.echo(path)
+
+
+@contextmanager
+def _progress(what: str, steps: int) -> Iterator[Any]:
+    columns: Sequence[Any] = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    console = Console(stderr=True)
+    # Elsewhere than on a terminal a bar that has gone leaves an empty line.
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=steps)
+        yield lambda: bar.advance(task)
+
+
+@contextmanager
+def refusals() -> Iterator[None]:
+    """What the engine refuses ends the command with a line instead of a traceback."""
+    from engine import EngineError  # noqa: PLC0415
+
+    try:
+        yield
+    except (EngineError, OSError) as error:
+        raise typer.BadParameter(str(error)) from error

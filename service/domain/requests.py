@@ -1,0 +1,245 @@
+"""What may be asked for: the body of POST /v1/grids, and the runs that it means.
+
+The one module of the API that knows the engine's specifications.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, StringConstraints, create_model
+
+from engine import (
+    PRINTABLE,
+    Analysis,
+    CameraChoice,
+    Expansion,
+    FirstSeed,
+    Grid,
+    GridRun,
+    Identifier,
+    Indices,
+    LensEquationError,
+    LensSystem,
+    Magnitudes,
+    NoiseLevel,
+    Optics,
+    Radii,
+    Realization,
+    Replicates,
+    Slopes,
+    SpecError,
+    Systems,
+    camera_names,
+    check_realization,
+    check_system,
+    engine_digest,
+    load_camera,
+    load_system,
+    preset_names,
+    spec_digest,
+    system_facts,
+    system_names,
+)
+from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
+from service.store.submission import PlannedRun
+
+_CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+def _optional_fields() -> dict[str, Any]:
+    """The engine's Analysis with every field optional, so that a request names only what differs."""
+    hints = get_type_hints(Analysis, include_extras=True)
+    return {field.name: (hints[field.name] | None, None) for field in dataclasses.fields(Analysis)}
+
+
+AnalysisRequest = create_model("AnalysisRequest", __config__=_CONFIG, **_optional_fields())
+AnalysisRequest.__doc__ = "What to change of the default analysis."
+
+if TYPE_CHECKING:
+    AnalysisBody = BaseModel
+else:
+    AnalysisBody = AnalysisRequest
+
+
+class GridRequest(BaseModel):
+    """A grid of realizations: the engine's Grid, in its own types, with a name and a partial analysis.
+
+    With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
+    lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
+    so is ``camera``, which takes the place of the systems' own. ``replicates`` repeats each point with seeds seed,
+    seed + 1, ...
+    """
+
+    model_config = _CONFIG
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=PRINTABLE)] | None = None
+    preset: Identifier | None = None
+    systems: Systems | None = None
+    n: Indices | None = None
+    r_eff: Radii | None = None
+    magnitude: Magnitudes | None = None
+    l_eta: Slopes | None = None
+    noise_level: NoiseLevel = "author"
+    mass_model: Identifier = "recommended"
+    optics: Optics | None = None
+    camera: CameraChoice | None = None
+    seed: FirstSeed = 0
+    replicates: Replicates = 1
+    analysis: AnalysisBody | None = None
+
+    def canonical(self) -> dict[str, Any]:
+        """What was asked for, without what was left out: kept with the grid and compared under an idempotency key."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+class TooManyRunsError(ValueError):
+    """A grid has more runs than the service takes."""
+
+    def __init__(self, runs: int, allowed: int) -> None:
+        super().__init__(f"the grid has {runs} runs, allowed are {allowed}")
+
+
+class Plan:
+    """The runs that a request means, in the engine's order: counted at once, made one by one as they are stored."""
+
+    def __init__(self, runs: Expansion) -> None:
+        self._runs = runs
+
+    def __len__(self) -> int:
+        """How many runs there are."""
+        return len(self._runs)
+
+    def __iter__(self) -> Iterator[PlannedRun]:
+        """Make the runs, anew each time."""
+        return map(_planned, self._runs)
+
+
+def plan(request: GridRequest, max_runs: int) -> Plan:
+    """What a request means; whatever is to be refused is refused here, before any run is made.
+
+    Raises
+    ------
+    engine.errors.SpecError
+        A value is not allowed.
+    TooManyRunsError
+        There would be more than ``max_runs``.
+    """
+    # Before anything is looked at: a few lists can mean more systems and slopes than there is time for.
+    lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
+    if request.preset is None:
+        _limit(math.prod(len(values or ()) for values in lists) * request.replicates, max_runs)
+    _check_own_systems(request)
+    runs = Expansion(_grid(request))
+    _limit(len(runs), max_runs)
+    for run in runs.samples:
+        _check(request, run.realization)
+    return Plan(runs)
+
+
+def _check_own_systems(request: GridRequest) -> None:
+    """Refuse here what every run would fail of: a system that has not the images its mass models make (a few ms each).
+
+    Those of the catalogue are as they have to be.
+    """
+    for place, system in enumerate(request.systems or ()):
+        if isinstance(system, LensSystem):
+            try:
+                check_system(system)
+            except SpecError as error:
+                field = "exposures.dither" if error.field == "dither" else error.field
+                raise SpecError(f"systems[{place}].{field}", error.value, error.allowed) from error
+            except LensEquationError as error:
+                models = f"systems[{place}].mass_models"
+                raise SpecError(
+                    models, sorted(system.mass_models), f"lenses whose images can be found: {error}"
+                ) from error
+
+
+def _check(request: GridRequest, realization: Realization) -> None:
+    """Refuse a realization that no run could end well with, by the place in the request that makes it so."""
+    try:
+        check_realization(realization)
+    except SpecError as error:
+        own = error.field.startswith("system.")
+        place = (request.systems or ()).index(realization.system) if own else 0
+        field = f"systems[{place}].{error.field.removeprefix('system.')}" if own else error.field
+        raise SpecError(field, error.value, error.allowed) from error
+
+
+def _limit(runs: int, allowed: int) -> None:
+    if runs > allowed:
+        raise TooManyRunsError(runs, allowed)
+
+
+def _grid(request: GridRequest) -> Grid:
+    cuts: dict[str, Any] = {
+        name: None if getattr(request, name) is None else tuple(getattr(request, name))
+        for name in ("systems", "n", "r_eff", "magnitude", "l_eta")
+    }
+    changes = {} if request.analysis is None else request.analysis.model_dump(exclude_none=True)
+    return Grid(
+        preset=request.preset,
+        mass_model=request.mass_model,
+        noise_level=request.noise_level,
+        optics=request.optics,
+        camera=request.camera,
+        seed=request.seed,
+        replicates=request.replicates,
+        analysis=Analysis(**changes),
+        **cuts,
+    )
+
+
+def _planned(run: GridRun) -> PlannedRun:
+    realization = run.realization
+    system = realization.system
+    camera = realization.camera or (load_system(system) if isinstance(system, str) else system).camera
+    inputs = {
+        "system": realization.system_name,
+        "camera": camera if isinstance(camera, str) else camera.name,
+        "mass_model": realization.mass_model,
+        "noise_level": realization.noise_level,
+        "noise_treatment": realization.analysis.noise_treatment,
+        "l_eta": realization.l_eta,
+        "n": realization.host.n,
+        "r_eff": realization.host.r_eff,
+        "magnitude": realization.host.magnitude,
+        "seed": realization.seed,
+    }
+    spec = realization.to_dict()
+    return PlannedRun(run.label, run.paper_run, spec, inputs, spec_digest(spec))
+
+
+def list_systems() -> list[SystemItem]:
+    """The catalogue's systems, in short."""
+    return [SystemItem(**_system_fields(name)) for name in system_names()]
+
+
+def system_view(name: str) -> SystemView:
+    """One system unabridged; a SpecError where the catalogue has none of that name."""
+    return SystemView(facts=system_facts(name), **_system_fields(name))
+
+
+def _system_fields(name: str) -> dict[str, Any]:
+    system = load_system(name)
+    return {
+        "name": name,
+        "camera": system.camera_name,
+        "mass_models": {model: sorted(map(float, slopes)) for model, slopes in system.mass_models.items()},
+        "links": {"self": f"/v1/systems/{name}"},
+    }
+
+
+def list_cameras() -> list[CameraItem]:
+    """The catalogue's cameras."""
+    fields = ("name", "pixel_scale", "drizzled_scale", "zero_point")
+    return [CameraItem(**{field: getattr(load_camera(name), field) for field in fields}) for name in camera_names()]
+
+
+def engine_view(version: str) -> EngineView:
+    """Which engine runs here."""
+    return EngineView(digest=engine_digest(), version=version, presets=list(preset_names()))

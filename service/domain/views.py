@@ -1,0 +1,390 @@
+"""What the API answers. Free of the engine, so that the client and the CLI start quickly."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.domain.payload import ChainPayload, EstimateName, StagePayload
+from service.domain.states import GridState, RunState
+
+UwsPhase = Literal["PENDING", "QUEUED", "HELD", "EXECUTING", "COMPLETED", "ERROR", "ABORTED"]
+UWS_PHASES: dict[str, UwsPhase] = {
+    "queued": "QUEUED",
+    "paused": "HELD",
+    "leased": "EXECUTING",
+    "running": "EXECUTING",
+    "done": "COMPLETED",
+    "failed": "ERROR",
+    "quarantined": "ERROR",
+    "cancelled": "ABORTED",
+}
+"""States in the words of the IVOA's Universal Worker Service."""
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Place(_Answer):
+    """One thing that is wrong with a request, and where."""
+
+    source: Literal["body", "query", "path", "header"] = Field(serialization_alias="in", validation_alias="in")
+    pointer: str
+    """JSON pointer into the body, or the name of the parameter."""
+    message: str
+
+
+class Problem(_Answer):
+    """RFC 9457: every error of the API."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str | None = None
+    instance: str | None = None
+    artefact: str | None = None
+    """Key of the artefact that cannot be given."""
+    errors: list[Place] = Field(default_factory=list)
+
+
+class RunCounts(_Answer):
+    """Runs of a grid by state."""
+
+    queued: int = 0
+    paused: int = 0
+    leased: int = 0
+    done: int = 0
+    failed: int = 0
+    quarantined: int = 0
+    cancelled: int = 0
+
+    @property
+    def ended(self) -> int:
+        """Runs that will not change by themselves."""
+        return self.done + self.failed + self.quarantined + self.cancelled
+
+
+class GridView(_Answer):
+    """A grid and how far it is."""
+
+    id: str
+    name: str | None
+    state: GridState
+    uws_phase: UwsPhase
+    n_runs: int
+    counts: RunCounts
+    progress: float
+    """Share of the runs that have ended."""
+    rate_per_s: float | None
+    """Runs that ended per second, over the latest hundred; None before the first."""
+    eta_seconds: float | None
+    created_at: datetime
+    finished_at: datetime | None
+    cancelled_at: datetime | None
+    paused_at: datetime | None
+    engine_digest: str | None
+    """Of the engine whose results the grid takes: the one that was installed where it was submitted."""
+    request: dict[str, Any]
+    links: dict[str, str]
+
+
+class GridPage(_Answer):
+    """A page of grids, newest first."""
+
+    items: list[GridView]
+    next: str | None
+    """Address of the next page."""
+
+
+class DryRun(_Answer):
+    """What a request would start."""
+
+    n_runs: int
+    labels: list[str]
+    """Labels of the first hundred runs."""
+
+
+class RunError(_Answer):
+    """Why a run has no result."""
+
+    code: str
+    detail: str | None
+
+
+class RunView(_Answer):
+    """A run, in lists."""
+
+    id: str
+    grid_id: str
+    ordinal: int
+    label: str
+    paper_run: int | None
+    state: RunState
+    uws_phase: UwsPhase
+    inputs: dict[str, Any]
+    attempt: int
+    suspect: bool
+    """It may have killed a worker, and is only run alone."""
+    error: RunError | None
+    finished_at: datetime | None
+    links: dict[str, str]
+
+
+class RunPage(_Answer):
+    """A page of a grid's runs in the grid's order."""
+
+    items: list[RunView]
+    next: str | None
+
+
+class Recovered(_Answer):
+    """A recovered quantity of one run; ``bias`` is recovered minus input."""
+
+    mean: float
+    sd: float
+    bias: float | None
+
+
+class EstimateView(_Answer):
+    """What one estimator recovered in one run."""
+
+    magnitude: Recovered
+    r_eff: Recovered
+    """Half-light radius on the intermediate axis [arcsec]."""
+    r_eff_galfit: Recovered | None
+    """The same on the major axis, GALFIT's convention; null in results that are older than this field."""
+    n: Recovered
+    q: Recovered
+    position_angle: Recovered
+    x: Recovered | None
+    """Centre in the source plane [arcsec]; null in older results."""
+    y: Recovered | None
+    draws: int
+    at_bound: int
+    """Draws whose fit ended at a bound of n or of r_eff."""
+    n_at_bound: int | None
+    r_eff_at_bound: int | None
+    failed: int
+
+
+class ApertureView(_Answer):
+    """Magnitude of the reconstructed source within ``radius`` arcsec; ``coverage`` of the circle is on its grid."""
+
+    radius: float
+    magnitude: Recovered
+    coverage: float
+    draws: int
+    failed: int
+
+
+class LensValue(_Answer):
+    """Posterior of one lens parameter."""
+
+    mean: float
+    sd: float
+    truth: float | None
+
+
+class ResultView(_Answer):
+    """Everything that was stored of a run."""
+
+    estimates: dict[EstimateName, EstimateView | None]
+    """Null where an estimator could fit no draw, and where the result is older than the estimator."""
+    aperture: ApertureView | None
+    regularisation: str | None
+    profile: str | None
+    lens: dict[str, LensValue]
+    chain: ChainPayload
+    ln_evidence: float
+    chi2: float
+    degrees_of_freedom: int
+    condition_number: float
+    arc_magnitude: float
+    agn_contrast: float | None
+    surface_brightness: float
+    wall_s: float
+    cpu_s: float
+    stages: list[StagePayload]
+    warnings: list[str]
+    versions: dict[str, str]
+    payload_digest: str
+    engine_digest: str
+    stored_at: datetime
+    figure: str | None
+    """Key of the figure in the artefact store."""
+    products: str | None
+
+
+class EventView(_Answer):
+    """Something that happened to a grid; ``detail`` depends on the kind."""
+
+    id: int
+    """Grows from event to event."""
+    grid_id: str
+    run_id: str | None
+    kind: str
+    detail: dict[str, Any]
+    created_at: datetime
+
+
+class EventPage(_Answer):
+    """Events of a grid, oldest first."""
+
+    items: list[EventView]
+    cursor: int
+    """Number of the last event up to here: with it as ``cursor`` the next answer goes on from here."""
+    ended: bool
+    """The grid has ended: nothing more comes, unless it is tried again."""
+    next: str | None
+
+
+class AttemptView(_Answer):
+    """One execution of a run, after it ended."""
+
+    number: int
+    generation: int
+    outcome: str
+    code: str | None
+    detail: str | None
+    started_at: datetime
+    ended_at: datetime
+
+
+class RunDetail(RunView):
+    """A run with its specification, its result and its attempts."""
+
+    spec: dict[str, Any]
+    digest: str
+    result: ResultView | None
+    attempts: list[AttemptView]
+
+
+class SummaryValue(_Answer):
+    """One quantity over the runs of one input.
+
+    ``sd`` is the mean of the runs' own standard deviations, ``scatter`` the standard deviation of the recovered means
+    between the runs (None for one run alone).
+    """
+
+    input: float | None
+    mean: float
+    sd: float
+    scatter: float | None
+    bias: float | None
+
+
+class SummaryEstimate(_Answer):
+    """One estimator over those runs of one input that have its answer."""
+
+    magnitude: SummaryValue
+    r_eff: SummaryValue
+    n: SummaryValue
+    runs: int
+    at_bound: int
+    failed: int
+
+
+class SummaryRow(_Answer):
+    """The runs that share an input (they differ in their seed)."""
+
+    input: dict[str, Any]
+    n_runs: int
+    estimates: dict[EstimateName, SummaryEstimate | None]
+
+
+class OverallValue(_Answer):
+    """One quantity over all stored runs of a grid: mean bias, its scatter between runs, mean of the runs' sd."""
+
+    bias: float | None
+    bias_scatter: float | None
+    sd: float
+
+
+class OverallEstimate(_Answer):
+    """One estimator over those stored runs of a grid that have its answer."""
+
+    magnitude: OverallValue
+    r_eff: OverallValue
+    n: OverallValue
+    runs: int
+
+
+class Summary(_Answer):
+    """Biases of a grid: a row for each input, and all together."""
+
+    grid_id: str
+    state: GridState
+    n_runs: int
+    n_stored: int
+    rows: list[SummaryRow]
+    overall: dict[EstimateName, OverallEstimate | None]
+    next: str | None
+
+
+class SystemItem(_Answer):
+    """A lens system of the catalogue, in short."""
+
+    name: str
+    camera: str
+    mass_models: dict[str, list[float]]
+    """l_eta of each mass model by its name."""
+    links: dict[str, str]
+
+
+class SystemList(_Answer):
+    """The catalogue's systems."""
+
+    items: list[SystemItem]
+
+
+class SystemView(SystemItem):
+    """A lens system with everything that the catalogue holds of it."""
+
+    facts: dict[str, Any]
+
+
+class CameraItem(_Answer):
+    """A camera of the catalogue."""
+
+    name: str
+    pixel_scale: float
+    drizzled_scale: float
+    zero_point: float
+
+
+class CameraList(_Answer):
+    """The catalogue's cameras."""
+
+    items: list[CameraItem]
+
+
+class EngineView(_Answer):
+    """Which engine this process would run."""
+
+    digest: str
+    version: str
+    presets: list[str]
+
+
+class Health(_Answer):
+    """The process answers."""
+
+    status: Literal["ok"] = "ok"
+
+
+class Readiness(_Answer):
+    """Whether requests are carried out: ``degraded`` accepts grids but nothing computes them now."""
+
+    status: Literal["ready", "degraded"]
+    database: Literal["ok"] = "ok"
+    dispatcher: Literal["ok", "missing"]
+    artefacts: Literal["ok", "away"] = "ok"
+    """``away``: the store takes nothing, and the dispatcher claims nothing until it does."""
+    workers: int
+    """Worker threads that runs are given to."""
+    engines: dict[str, int]
+    """Worker threads of each engine by its digest: a grid waits where its own is not among them."""
+    beat_at: datetime | None

@@ -1,0 +1,16 @@
+"""Loads what every worker needs, in the process that workers are forked from; see :mod:`service.worker.fork_server`."""
+
+import gc
+import logging
+from importlib import import_module
+
+# Next to nothing of it becomes garbage, and to look for that again and again takes a sixth of the time.
+gc.disable()
+for name in ("distributed.nanny", "distributed.worker", "service.runtime.logs", "service.worker.tasks", "engine"):
+    try:
+        import_module(name)
+    except Exception:
+        # Each worker tries again when it is greeted, and its answer tells the dispatcher what is wrong.
+        logging.getLogger(__name__).exception("%s cannot be loaded", name)
+gc.freeze()
+gc.enable()
