@@ -37,7 +37,7 @@ from engine.simulation.scene import build_scene
 from engine.simulation.simulate import simulate
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, cast_rays, map_rays
-from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.source.regularisation import SourceModel, sparse_regularisation
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
@@ -51,7 +51,7 @@ def dense_ln_evidence(
     white = likelihood.whitened
     g = np.hstack([white.noise.whiten(likelihood.blurring @ mapping.dense()), white.columns])
     n, k = model.shape[0] * model.shape[1], white.columns.shape[1]
-    h = regularisation_matrix(model)
+    h = sparse_regularisation(model).toarray()
     a = g.T @ g
     a[:n, :n] += math.exp(ln_lambda) * h
     d = g.T @ white.data

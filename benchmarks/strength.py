@@ -22,7 +22,7 @@ from engine.parametric.fit import fit_parametric
 from engine.simulation.scene import build_scene
 from engine.simulation.simulate import simulate
 from engine.source.lensing_matrix import map_rays
-from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant, regularisation_matrix
+from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant, sparse_regularisation
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
@@ -70,7 +70,7 @@ def single_precision(
     w = likelihood.w_tilde.dense() - likelihood.border @ likelihood.border.T
     rounded_w = w.astype(np.float32).astype(np.float64)
     single = (dense.T.astype(np.float32) @ (w.astype(np.float32) @ dense.astype(np.float32))).astype(np.float64)
-    h = math.exp(ln_lambda) * regularisation_matrix(model)
+    h = math.exp(ln_lambda) * sparse_regularisation(model).toarray()
     constant = likelihood.ln_constant - 0.5 * likelihood.dd + 0.5 * (ln_determinant(model) + d.size * ln_lambda)
 
     def value(f: FloatArray, dtype: type) -> float:

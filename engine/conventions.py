@@ -91,11 +91,6 @@ def paper_einstein_radius(theta_E: float, q: float, slope: float) -> float:
     return float(theta_E * q**-0.5 * ((1.0 + q) / 2.0) ** (1.0 / eta))
 
 
-def intermediate_einstein_radius(paper_radius: float, q: float, slope: float) -> float:
-    """Intermediate-axis theta_E [arcsec] from R_E of the paper's eq. (2)."""
-    return float(paper_radius / paper_einstein_radius(1.0, q, slope))
-
-
 def pixel_centres(n: int, scale: float) -> FloatArray:
     """Coordinates [arcsec] of the centres of n pixels along one axis, with the origin at the middle of the axis."""
     return (np.arange(n, dtype=np.float64) - (n - 1) / 2.0) * scale

@@ -207,17 +207,3 @@ def sample_sersic(
     u, v = _tracer(profile, lens)(np.tile(x, y.size), np.repeat(y, x.size))
     rays = brightness(u, v, tabulate(profile)).reshape(y.size, x.size)
     return np.asarray(rays * (profile.flux * side**2))
-
-
-def sample_lensed_sersic(
-    profile: SersicProfile, lens: PowerLawLens, x: FloatArray, y: FloatArray, pixel_scale: float, subrays: int
-) -> FloatArray:
-    """Flux per pixel [e-/s] as the mean over ``subrays`` x ``subrays`` rays: quick, without an error bound.
-
-    For fits that need many renderings; arguments and shapes as in :func:`render_sersic`.
-    """
-    offsets = ((np.arange(subrays) + 0.5) / subrays - 0.5) * pixel_scale
-    columns, rows = np.add.outer(x, offsets).ravel(), np.add.outer(y, offsets).ravel()
-    u, v = _tracer(profile, lens)(np.tile(columns, rows.size), np.repeat(rows, columns.size))
-    rays = brightness(u, v, tabulate(profile)).reshape(len(y), subrays, len(x), subrays)
-    return np.asarray(rays.mean(axis=(1, 3)) * (profile.flux * pixel_scale**2))

@@ -13,7 +13,7 @@ from engine.errors import ObservationError, PosteriorError
 from engine.imaging.observation import Observation
 from engine.parametric.model import ImageModel, weights_sigma, window_round
 from engine.parametric.parameters import HOST_FLUX, ParameterSpace
-from engine.parametric.point_sources import Detection, candidate_point_sources
+from engine.parametric.point_sources import Detection, find_point_sources
 from engine.parametric.solution import Solution, minimise
 from engine.parametric.starts import (
     Start,
@@ -67,7 +67,7 @@ class Task:
 
     def candidates(self, most: int) -> tuple[Detection, ...]:
         """At most that many point sources."""
-        return candidate_point_sources(
+        return find_point_sources(
             self.image, self.noise, self.observation.psf, self.observation.pixel_scale, most, self.centre
         )
 

@@ -8,7 +8,7 @@ from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.source.lensing_matrix import cast_rays, map_rays
-from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.source.regularisation import SourceModel, sparse_regularisation
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
 SCALE = 0.1
@@ -80,7 +80,7 @@ class Case:
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance
         inverse = np.linalg.inv(c)
-        h = regularisation_matrix(model)
+        h = sparse_regularisation(model).toarray()
         a = g.T @ inverse @ g
         a[:n, :n] += math.exp(ln_lambda) * h
         a[n:, n:] += np.diag(self.precisions)

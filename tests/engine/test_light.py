@@ -13,7 +13,7 @@ from engine.lensing.power_law import PowerLawLens, convergence_and_shear, source
 from engine.light import radial_table, refinement, rendering
 from engine.light.brightness_bounds import brightness_range
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
-from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_lensed_sersic
+from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_sersic
 from engine.light.sersic import SersicProfile, mean_surface_brightness, sersic_constants, sersic_k, surface_brightness
 from engine.simulation.scene import build_scene
 from engine.spec.realization import Realization
@@ -355,7 +355,8 @@ def test_sampled_rendering_is_the_mean_over_the_rays() -> None:
     lens = PowerLawLens(1.2, 0.8, 0.5, 2.1)
     profile = SersicProfile(10.0, 0.3, 2.0, 0.7, 0.3, 0.03, 0.05)
     x, y = np.linspace(-1, 1, 11), np.linspace(-0.8, 0.8, 9)
-    ours = sample_lensed_sersic(profile, lens, x, y, 0.2, 3)
+    rays_x, rays_y = (np.add.outer(axis, 0.2 * np.array([-1.0, 0.0, 1.0]) / 3.0).ravel() for axis in (x, y))
+    ours = sample_sersic(profile, lens, rays_x, rays_y, 0.2 / 3).reshape(9, 3, 11, 3).sum(axis=(1, 3))
     # The radial table is within 1e-7 of the profile here.
     assert np.allclose(ours, supersampled(profile, x, y, 0.2, 3, lens), rtol=1e-7)
 

@@ -50,9 +50,9 @@ def test_the_agn_images_are_found_within_a_tenth_of_a_pixel(scene: Scene, simula
 
 
 def test_more_images_than_there_are_is_refused(simulation: Simulation) -> None:
-    flat = np.zeros(simulation.observation.shape)
-    with pytest.raises(ObservationError, match="agn"):
-        find_point_sources(flat, flat + 1.0, simulation.observation.psf, 0.08, 2)
+    flat = replace(simulation.observation, image=np.zeros(simulation.observation.shape))
+    with pytest.raises(ObservationError, match="agn: found 0 point sources of 2"):
+        find_starts(task_of(flat), 2, None, None)
 
 
 def test_a_lens_is_found_from_the_positions_of_a_quad_and_of_a_double() -> None:
