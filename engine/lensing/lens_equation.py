@@ -55,7 +55,7 @@ def _determinant(x: float, y: float, lens: LensConstants) -> float:
 
 @kernel
 def _polish(x: float, y: float, sx: float, sy: float, lens: LensConstants) -> tuple[float, float, bool]:
-    """Damped Newton on the lens equation; whether it converged to rounding."""
+    """Damped Newton from (x, y) to an image of the source (sx, sy) [arcsec]; whether it converged to rounding."""
     ax, ay = deflect_point(x, y, lens)
     fx, fy = x - ax - sx, y - ay - sy
     error = math.hypot(fx, fy)
@@ -135,7 +135,7 @@ def _map_cell(x: float, y: float, side: float, sx: float, sy: float, lens: LensC
 
 @kernel
 def _candidates(sx: float, sy: float, half: float, theta_E: float, lens: LensConstants, found: FloatArray) -> int:
-    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many there are."""
+    """Cells that may hold images: centre and side [arcsec], written into ``found`` (n, 3); how many there are."""
     stack = np.empty((512, 4))
     # Off the lens by an irrational part, so that no corner and no centre ever falls on it.
     stack[0, 0], stack[0, 1] = lens.x + 0.0318309886 * half, lens.y + 0.0271828183 * half
@@ -169,7 +169,7 @@ def _candidates(sx: float, sy: float, half: float, theta_E: float, lens: LensCon
 def _images(
     candidates: FloatArray, sx: float, sy: float, theta_E: float, lens: LensConstants, roots: FloatArray
 ) -> int:
-    """Distinct images reached from the candidate cells, written into ``roots`` (n, 2); how many."""
+    """Distinct images [arcsec] reached from the candidate cells, written into ``roots`` (n, 2); how many."""
     n = 0
     for c in range(candidates.shape[0]):
         for k in range(5):

@@ -203,12 +203,13 @@ def _map_rays(x: FloatArray, y: FloatArray, lens: LensConstants, bx: FloatArray,
 
 @kernel
 def trace_rays(x: FloatArray, y: FloatArray, lens: LensConstants, bx: FloatArray, by: FloatArray) -> None:
-    """Source positions of image positions, written into ``bx`` and ``by`` (all one-dimensional, same length)."""
+    """Source positions of image positions, written into ``bx`` and ``by``; all (k,), in arcsec."""
     _map_rays(x, y, lens, bx, by, True)
 
 
 @kernel
 def _deflect_rays(x: FloatArray, y: FloatArray, lens: LensConstants, ax: FloatArray, ay: FloatArray) -> None:
+    """Deflections [arcsec] at image positions (k,) [arcsec], written into ``ax`` and ``ay`` (k,)."""
     # Not x - (x - alpha): far from the lens that would lose the digits of alpha.
     _map_rays(x, y, lens, ax, ay, False)
 
@@ -239,6 +240,7 @@ def jacobian_point(x: float, y: float, lens: LensConstants) -> tuple[float, floa
 
 @kernel
 def _convergence_and_shear(x: FloatArray, y: FloatArray, lens: LensConstants, out: FloatArray) -> None:
+    """Convergence and shear components at image positions (k,) [arcsec], written into ``out`` (3, k)."""
     for i in range(x.size):
         out[0, i], out[1, i], out[2, i] = jacobian_point(x[i], y[i], lens)
 

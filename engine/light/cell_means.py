@@ -169,6 +169,7 @@ def new_stack() -> FloatArray:
 
 @kernel
 def _grid_columns(x_edges: FloatArray, y_edges: FloatArray, c: ShapeConstants) -> FloatArray:
+    """Means (ny nx, COLUMNS) over the cells between edges (nx + 1,) and (ny + 1,) [arcsec]."""
     nx, ny = x_edges.size - 1, y_edges.size - 1
     out = np.empty((nx * ny, COLUMNS))
     total, stack = np.empty(COLUMNS), new_stack()

@@ -57,7 +57,8 @@ def _average(
     """Mean brightness over each pixel from its central ray and its neighbours', and an estimate of its error.
 
     The mean of f over a cell of unit side is f + (dxx + dyy)/24 - 17 (dxxxx + dyyyy)/5760 + dxxyy/576 in central
-    differences, up to sixth order. ``u``, ``v``, ``f`` have a halo of two pixels.
+    differences, up to sixth order. ``u`` and ``v``, where rays map to in axes of the profile, and the brightness ``f``
+    there are (ny + 4, nx + 4), with a halo of two pixels; ``mean`` and ``error`` (ny, nx) are written.
     """
     for j in range(mean.shape[0]):
         for i in range(mean.shape[1]):
@@ -108,6 +109,7 @@ def _greatest_of_neighbours(error: FloatArray) -> FloatArray:
 
 @kernel
 def _sum_below(error: FloatArray, limit: float) -> float:
+    """Sum of the errors (ny, nx) that are at most ``limit``."""
     total = 0.0
     for j in range(error.shape[0]):
         for i in range(error.shape[1]):

@@ -31,6 +31,8 @@ from engine.parametric.uncertainty import host_posteriors, parameter_covariance
 from engine.result import IndexPrior
 from engine.spec.priors import LensParameterName, ParameterPrior
 
+__all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametric"]
+
 HOST_NAMES = ("flux", "r_eff", "n", "q", "phi", "x", "y")
 GOOD_START = Acceptance()
 

@@ -134,7 +134,7 @@ def quick_fits(task: Task, group: list[Start]) -> list[Solution]:
     # One noise map for all hypotheses, or their chi^2 could not be compared.
     light = agn_light(observation, task.candidates(_ERRING_CANDIDATES))
     sigma = weights_sigma(observation, observation.optics.agn_variance(light))
-    model = ImageModel(observation, space, sigma, window, subrays=_QUICK_SUBRAYS, exact=False, priors=task.priors)
+    model = ImageModel(observation, space, sigma, window, subrays=_QUICK_SUBRAYS, exact=False)
     if len(group) > 2 * _ARC_STARTS:
         group = _best_linear(model, group)
     out = []

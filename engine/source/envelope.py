@@ -85,6 +85,7 @@ def _one_at_r_eff(profile: SersicProfile) -> SersicProfile:
 
 @kernel
 def _envelope_at(bx: FloatArray, by: FloatArray, light: SersicConstants, table: FloatArray, floor: float) -> FloatArray:
+    """Value of the envelope (k,) at points (k,) [arcsec] of the source plane, from its radial ``table`` (bins, 4)."""
     out = np.empty(bx.size)
     for i in range(bx.size):
         dx, dy = bx[i] - light.x, by[i] - light.y

@@ -126,6 +126,7 @@ def cast_rays(
 
 @kernel
 def _bounds(bx: FloatArray, by: FloatArray, in_mask: NDArray[np.bool_], per_pixel: int) -> tuple[float, ...]:
+    """Left, right, bottom and top [arcsec] of the mapped rays (pixels per_pixel,) of the pixels in the mask."""
     left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
     for pixel in range(in_mask.size):
         if in_mask[pixel]:
@@ -170,6 +171,11 @@ def _fill(
     weights: FloatArray,
     entries: NDArray[np.int32],
 ) -> None:
+    """Rows of L from mapped rays (pixels per_pixel,) [arcsec] and nodes ``x`` (nx,), ``y`` (ny,).
+
+    A ray stands for ``ray_weight`` arcsec^2, times ``envelope`` at each ray where that is not empty. ``columns`` and
+    ``weights`` (pixels, 4 per_pixel) and ``entries`` (pixels,) are written, as :class:`LensingMatrix` has them.
+    """
     nx = x.size
     i, j = 0, 0
     for pixel in range(entries.size):
@@ -210,6 +216,7 @@ def _fill(
 def _apply(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], source: FloatArray
 ) -> FloatArray:
+    """L times a source (ny nx,): fluxes (pixels,)."""
     out = np.zeros(entries.size)
     for p in range(entries.size):
         for e in range(entries[p]):
@@ -221,6 +228,7 @@ def _apply(
 def _transpose(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], image: FloatArray, n: int
 ) -> FloatArray:
+    """L^T times an image (pixels,): shape (n,)."""
     out = np.zeros(n)
     for p in range(entries.size):
         for e in range(entries[p]):

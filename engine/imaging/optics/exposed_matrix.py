@@ -99,6 +99,13 @@ def _fill_matrix(
     at_column: FloatArray,
     radius: int,
 ) -> None:
+    """Responses of M pixels to the light of p others, written into ``out`` (M, p), zero beyond ``radius`` pixels.
+
+    ``native`` (n, n) is that of a native pixel by sub-pixel offset. Pixel m takes native pixels ``indptr[m]`` to
+    ``indptr[m + 1]``, whose first sub-pixels are at ``first_row`` and ``first_column`` (e,), with ``shares`` (e,).
+    ``to_row``, ``to_column`` (M,), ``of_row`` and ``of_column`` (p,) are pixels of the image; ``at_row`` and
+    ``at_column`` (p,) say where the light stands, in sub-pixels.
+    """
     size = native.shape[0]
     centre = size // 2
     half_shifted, shifted = np.empty((size, size)), np.empty((size, size))
