@@ -74,12 +74,6 @@ class ParametricFit:
         return max(1.0, self.chi2 / self.degrees_of_freedom)
 
 
-def _refuse(options: dict[str, tuple[object, bool, str]]) -> None:
-    for name, (value, good, allowed) in options.items():
-        if not good:
-            raise SpecError(name, value, allowed)
-
-
 def fit_parametric(
     observation: Observation,
     *,
@@ -122,12 +116,10 @@ def fit_parametric(
         No start leads to an acceptable fit; the message says what is wrong with the best.
     """
     radius = min(observation.shape) * observation.pixel_scale / 2
-    _refuse(
-        {
-            "agn_images": (agn_images, agn_images is None or 0 <= agn_images <= 8, "a number from 0 to 8"),
-            "theta_E": (theta_E, theta_E is None or 0 < theta_E < radius, f"a radius on the image, below {radius:g}"),
-        }
-    )
+    if agn_images is not None and not 0 <= agn_images <= 8:
+        raise SpecError("agn_images", agn_images, "a number from 0 to 8")
+    if theta_E is not None and not 0 < theta_E < radius:
+        raise SpecError("theta_E", theta_E, f"a radius on the image, below {radius:g}")
     task = prepare_task(observation, deflector=deflector, shear=shear, acceptance=acceptance, priors=priors)
     groups = find_starts(task, agn_images, theta_E, positions)
     refusals: list[str] = []
