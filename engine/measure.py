@@ -19,8 +19,9 @@ from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.estimators.image import image_estimate
 from engine.imaging.observation import Observation
-from engine.parametric.fit import Acceptance, ParametricFit
-from engine.parametric.psf_error import noise_scale
+from engine.parametric.fit import ParametricFit
+from engine.parametric.residual_noise import noise_scale
+from engine.parametric.search import Acceptance
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
@@ -103,7 +104,7 @@ class ImageMeasurement:
         if self.inversion is None:
             return None
         chi2 = self.inversion.chi2
-        if self.observation.response is None:
+        if self.observation.optics.misfit_is_noise:
             # The inversion takes what the fit misses for noise, which must not make the two incomparable.
             residual = self.inversion.image_plane.residual * self.observation.noise
             chi2 = _chi2(self.observation, self.fit, residual, self.noise_scale)

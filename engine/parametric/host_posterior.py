@@ -6,10 +6,9 @@ import math
 from dataclasses import dataclass, replace
 
 from engine.conventions import FloatArray
-from engine.light.sersic import SersicProfile
-from engine.parametric.model import sersic_of
+from engine.light.sersic import SHAPE, SersicProfile, profile_of
 
-COORDINATES = ("ln_flux", "ln_r_eff", "n", "e1", "e2", "x", "y")
+COORDINATES = ("ln_flux", *SHAPE)
 _N = COORDINATES.index("n")
 
 
@@ -33,7 +32,7 @@ class HostPosterior:
     @property
     def profile(self) -> SersicProfile:
         """The profile at its maximum."""
-        return sersic_of(self.mean[1:], math.exp(self.mean[0]))
+        return profile_of(self.mean[1:], math.exp(self.mean[0]))
 
     def inside(self, low: float, high: float) -> HostPosterior:
         """The same, cut off at bounds of n between which its maximum lies."""
