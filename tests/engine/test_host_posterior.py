@@ -73,7 +73,7 @@ def test_the_estimate_has_the_moments_of_the_posterior(host: HostPosterior) -> N
 
 
 def test_flux_index_and_place_are_the_gaussians_own() -> None:
-    host = posterior()
+    host = posterior(0.01)
     estimate, sd = image_estimate(host, "wide", 25.0), np.sqrt(np.diag(host.covariance))
     assert estimate.magnitude.mean == pytest.approx(25.0 - 2.5 / math.log(10.0) * host.mean[0], rel=1e-12)
     assert estimate.magnitude.sd == pytest.approx(2.5 / math.log(10.0) * sd[0], rel=1e-9)
@@ -107,7 +107,7 @@ def test_what_is_held_does_not_move() -> None:
 
 
 def test_errors_that_are_larger_are_larger_in_everything() -> None:
-    host = posterior()
+    host = posterior(0.01)
     one, two = (image_estimate(each, "wide", 25.0) for each in (host, host.inflated(1.5)))
     for name in ("magnitude", "n", "x"):
         assert getattr(two, name).mean == pytest.approx(getattr(one, name).mean, rel=1e-9)
