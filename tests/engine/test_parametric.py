@@ -259,7 +259,8 @@ def test_what_strays_from_its_start_fit_by_fit_is_told(simulation: Simulation, n
     away[k] = low[k] + 0.01 * (high[k] - low[k])
     assert name not in replace(found, values=away).at_bound
     away[k] = low[k] - 0.1 * (high[k] - low[k])
-    own_low, own_high = space.bounds(away, simulation.observation.pixel_scale, {})
+    own_low, own_high = found.low.copy(), found.high.copy()
+    own_low[k], own_high[k] = away[k] - 1.0, away[k] + 1.0
     again = replace(found, values=away, low=own_low, high=own_high)
     assert not space.at_bound(away, own_low, own_high)
     assert again.at_bound == (name,)
