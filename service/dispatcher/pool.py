@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.leases import Lease
 from service.worker.answers import NotPlainError, read_greeting
-from service.worker.tasks import call_tasks, greet
+from service.worker.tasks import answer_run, greet
 
 _LOG = logging.getLogger(__name__)
 _STOP_S = 5.0
@@ -125,11 +125,10 @@ class Pool:
         except (OSError, NotPlainError, TypeError, ValueError, KeyError):
             return None
 
-    def submit(self, leases: Sequence[Lease], worker: Worker) -> Any:
-        """Start runs, one after the other as one task; the future of their answers, in the same order."""
-        specs = [lease.spec for lease in leases]
-        fields = [logs.fields_of(lease) for lease in leases]
-        return self._on(worker.address, leases[0].key, call_tasks, specs, self._settings.artefacts, fields)
+    def submit(self, lease: Lease, worker: Worker) -> Any:
+        """Start a run; the future of its answer."""
+        fields = logs.fields_of(lease)
+        return self._on(worker.address, lease.key, answer_run, lease.spec, self._settings.artefacts, fields)
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""
@@ -152,7 +151,7 @@ class Pool:
         self._workers.pop(address, None)
 
     def closed_on_purpose(self, address: str) -> bool:
-        """Whether a worker that is gone was told to go (a signal, the end of its lifetime) and did not die."""
+        """Whether a worker that is gone was told to go (by a signal, say) and did not die."""
         try:
             events = self._client.get_events(address)
         except (OSError, TimeoutError, NotPlainError, RuntimeError):
