@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.timing import least
 from engine.conventions import FloatArray
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
 from engine.likelihood.evidence import ln_evidence, normal_equations
 from engine.likelihood.problem import prepare_problem
@@ -22,7 +22,7 @@ from engine.parametric.fit import fit_parametric
 from engine.simulation.scene import build_scene
 from engine.simulation.simulate import simulate
 from engine.source.lensing_matrix import map_rays
-from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant, regularisation_matrix
+from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant, sparse_regularisation
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
@@ -66,11 +66,11 @@ def single_precision(
     exact = ln_evidence(likelihood, lens, ln_lambda, model)
     f, d = normal_equations(likelihood, lens, model)
     f = np.tril(f) + np.tril(f, -1).T
-    dense = map_rays(likelihood.rays, kernel_arguments(lens), model.shape).dense()
+    dense = map_rays(likelihood.rays, lens, model.shape).dense()
     w = likelihood.w_tilde.dense() - likelihood.border @ likelihood.border.T
     rounded_w = w.astype(np.float32).astype(np.float64)
     single = (dense.T.astype(np.float32) @ (w.astype(np.float32) @ dense.astype(np.float32))).astype(np.float64)
-    h = math.exp(ln_lambda) * regularisation_matrix(model)
+    h = math.exp(ln_lambda) * sparse_regularisation(model).toarray()
     constant = likelihood.ln_constant - 0.5 * likelihood.dd + 0.5 * (ln_determinant(model) + d.size * ln_lambda)
 
     def value(f: FloatArray, dtype: type) -> float:

@@ -19,8 +19,9 @@ from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.imaging.observation import Observation
-from engine.parametric.fit import HOST_NAMES, Acceptance, ParametricFit, fit_parametric
-from engine.parametric.psf_error import noise_scale
+from engine.parametric.fit import HOST_NAMES, ParametricFit, fit_parametric
+from engine.parametric.residual_noise import noise_scale
+from engine.parametric.search import Acceptance
 from engine.result import Estimate, LensParameter
 from engine.run import Measurement, measure
 from engine.spec.analysis import PROFILES, Analysis
@@ -123,7 +124,7 @@ class ImageMeasurement:
         if self.inversion is None:
             return None
         chi2 = self.inversion.chi2
-        if self.observation.response is None:
+        if self.observation.optics.misfit_is_noise:
             # The inversion takes what the fit misses for noise, which must not make the two incomparable.
             residual = self.inversion.products.residual * self.observation.noise
             chi2 = _chi2(self.observation, self.fit, residual, self.noise_scale)

@@ -58,8 +58,8 @@ class SourceDraw:
         e = MAX_ELLIPTICITY
         pitch = math.sqrt(float(self.grid.cell_areas.min()))
         side = max(right - left, top - bottom)
-        low = [math.log(_SMALLEST_RADIUS * pitch), -e, -e, left, bottom, index_range[0]]
-        high = [math.log(_LARGEST_RADIUS * side), e, e, right, top, index_range[1]]
+        low = [math.log(_SMALLEST_RADIUS * pitch), index_range[0], -e, -e, left, bottom]
+        high = [math.log(_LARGEST_RADIUS * side), index_range[1], e, e, right, top]
         return np.array(low), np.array(high)
 
 

@@ -23,7 +23,8 @@ from engine.estimators.least_squares import Fits, Metric, fit_shapes, scatter
 from engine.estimators.paper import PaperMetric
 from engine.estimators.projected import ProjectedMetric
 from engine.estimators.sersic_fit import Refit, SersicFit
-from engine.light.cell_means import LN_R_EFF, N, X, Y, profile_of
+from engine.light.cell_means import LN_R_EFF, N, X, Y
+from engine.light.sersic import profile_of
 from engine.result import INDEX_RANGES, EstimatorName, IndexPrior
 
 _BOUND_MARGIN = 1e-3
@@ -42,7 +43,7 @@ def _moments(draw: SourceDraw) -> FloatArray:
     xx, yy, xy = (float((weight * u).sum()) for u in ((x - cx) ** 2, (y - cy) ** 2, (x - cx) * (y - cy)))
     size = max(xx + yy, float(grid.cell_areas.min()))
     e = np.clip(0.5 * np.array([(xx - yy) / size, 2 * xy / size]), -0.5, 0.5)
-    return np.array([0.5 * math.log(size), *e, cx, cy, 2.0])
+    return np.array([0.5 * math.log(size), 2.0, *e, cx, cy])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from scipy import sparse
 from engine.errors import ObservationError
 from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
-from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.exposed import ExposedOptics
 
 FORMAT_VERSION = 2
 _KEYWORD = re.compile(r"[A-Z][A-Z0-9_-]{0,7}")
@@ -107,7 +107,7 @@ def _covariance_table(covariance: sparse.csr_matrix) -> fits.BinTableHDU:
     )
 
 
-def _exposures(response: PointResponse) -> fits.ImageHDU:
+def _exposures(response: ExposedOptics) -> fits.ImageHDU:
     """The optical PSF on sub-pixels, with sampling and detector kernel as JSON text in its header."""
     plane = fits.ImageHDU(response.psf, name="EXPOSURES")
     plane.header["LONGSTRN"] = "OGIP 1.0"
@@ -116,7 +116,7 @@ def _exposures(response: PointResponse) -> fits.ImageHDU:
     return plane
 
 
-def _response(plane: fits.ImageHDU) -> PointResponse:
+def _response(plane: fits.ImageHDU) -> ExposedOptics:
     values = json.loads(plane.header["SAMPLING"])
     try:
         # JSON has lists where the geometry has tuples, on which its hash depends.
@@ -124,7 +124,7 @@ def _response(plane: fits.ImageHDU) -> PointResponse:
         geometry = Geometry(**tuples)
     except TypeError as error:
         raise ObservationError(f"EXPOSURES: its sampling is not of this layout ({error})") from error
-    return PointResponse(plane.data.astype(np.float64), geometry, np.array(json.loads(plane.header["DETECTOR"])))
+    return ExposedOptics(plane.data.astype(np.float64), geometry, np.array(json.loads(plane.header["DETECTOR"])))
 
 
 def _tuples(value: Any) -> Any:

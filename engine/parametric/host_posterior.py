@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from engine.conventions import FloatArray
-from engine.light.sersic import SersicProfile
-from engine.parametric.model import sersic_of
+from engine.light.sersic import SHAPE, SersicProfile, profile_of
 
-COORDINATES = ("ln_flux", "ln_r_eff", "n", "e1", "e2", "x", "y")
+COORDINATES = ("ln_flux", *SHAPE)
 _N = COORDINATES.index("n")
 _ROUNDS = 64
 """How often draws outside the bounds are drawn again."""
@@ -49,12 +48,12 @@ class HostPosterior:
             again = rng.standard_normal((int(outside.sum()), self.mean.size))
             points[outside] = self.mean + again @ root.T
         points = np.clip(points, self.low, self.high)
-        return tuple(sersic_of(point[1:], math.exp(point[0])) for point in points)
+        return tuple(profile_of(point[1:], math.exp(point[0])) for point in points)
 
     @property
     def profile(self) -> SersicProfile:
         """The profile at its maximum."""
-        return sersic_of(self.mean[1:], math.exp(self.mean[0]))
+        return profile_of(self.mean[1:], math.exp(self.mean[0]))
 
     def inside(self, low: float, high: float) -> HostPosterior:
         """The same, cut off at bounds of n between which its maximum lies."""

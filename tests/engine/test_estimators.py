@@ -13,8 +13,8 @@ from engine.estimators.least_squares import fit_shapes, scatter
 from engine.estimators.projected import ProjectedMetric
 from engine.estimators.refit import Refit, SersicFit, refit_draws
 from engine.estimators.summaries import summarise, summarise_aperture
-from engine.light.cell_means import columns_on_grid, profile_of, profile_on_grid, shape_of
-from engine.light.sersic import SersicProfile, flux_in_circle, surface_brightness
+from engine.light.cell_means import N, columns_on_grid, profile_on_grid
+from engine.light.sersic import SersicProfile, flux_in_circle, profile_of, shape_of, surface_brightness
 from engine.likelihood.evidence import invert
 from engine.result import EstimatorName
 from engine.run import Truth, _refit
@@ -201,7 +201,7 @@ def test_scatter_at_a_fixed_shape_is_the_noise_of_the_flux_and_stays_inside_boun
     shapes, _ = scatter(metric, which, fits, low, high, generators)
     assert (shapes >= low).all()
     assert (shapes <= high).all()
-    assert shapes[:, 5].std() > 0.0
+    assert shapes[:, N].std() > 0.0
 
 
 def test_an_estimator_without_an_answer_is_missing_with_a_warning_and_the_others_stay() -> None:

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from benchmarks.biases import paper_runs
 from benchmarks.coverage import drawn_realization
-from engine.conventions import FloatArray, rate_to_magnitude
+from engine.conventions import FloatArray, ellipticity, rate_to_magnitude
 from engine.estimators.image import refit_image
 from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.parametric.host_posterior import COORDINATES, HostPosterior
-from engine.parametric.model import components
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.priors import ParameterPrior
@@ -37,7 +36,7 @@ def posterior(sd: float = 0.05, n: float = 2.0, low: float = 0.3, high: float = 
 def coordinates(host: HostPosterior, number: int, seed: int = 0) -> FloatArray:
     profiles = host.draws(number, np.random.default_rng(seed))
     rows = [
-        (math.log(p.flux), math.log(p.r_eff), p.n, *components(p.q, p.phi), p.x, p.y)
+        (math.log(p.flux), math.log(p.r_eff), p.n, *ellipticity(p.q, p.phi), p.x, p.y)
         for p in profiles
     ]  # fmt: skip
     return np.array(rows)

@@ -19,7 +19,6 @@ from engine.catalogue import (
 )
 from engine.conventions import (
     image_angle,
-    intermediate_einstein_radius,
     magnitude_to_rate,
     paper_einstein_radius,
     position_angle,
@@ -241,11 +240,6 @@ def test_a_wrong_number_of_agn_images_is_refused() -> None:
 def test_position_angles_go_there_and_back(angle: float) -> None:
     difference = abs(position_angle(image_angle(angle)) - angle)
     assert min(difference, 180 - difference) < 1e-9
-
-
-@given(q=st.floats(0.2, 1.0), slope=st.floats(1.3, 2.7))
-def test_einstein_radii_of_both_conventions_go_there_and_back(q: float, slope: float) -> None:
-    assert intermediate_einstein_radius(paper_einstein_radius(1.3, q, slope), q, slope) == pytest.approx(1.3)
 
 
 def test_the_papers_einstein_radius_is_seven_percent_off_at_q_0_6() -> None:
