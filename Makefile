@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The constraints hold for build dependencies too, hence also as a variable.
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet -c constraints.txt
 
-.PHONY: help demo serve test check-long lint bench tables clean install install-test
+.PHONY: help demo serve test check-long lint bench tables docs clean install install-test install-docs
 .DEFAULT_GOAL := help
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make lint        ruff and mypy"
 	@echo "make bench       benchmarks: the answer asserted, then the time as a ratio to a peer"
 	@echo "make tables      the tables in docs/tables: error, time and memory of the simulation and of the evidence"
+	@echo "make docs        the documentation as a site in build/docs; a warning is an error"
 	@echo "make clean       remove the virtual environment and caches (not var/, where data lies)"
 
 $(BIN)/python:
@@ -35,9 +36,16 @@ $(VENV)/installed-test: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -e '.[test]'
 	@touch $@ $(VENV)/installed
 
+$(VENV)/installed-docs: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing hostlens and what its documentation needs into $(VENV) (a minute or two)"
+	$(INSTALL) -e '.[docs]'
+	@touch $@ $(VENV)/installed
+
 install: $(VENV)/installed
 
 install-test: $(VENV)/installed-test
+
+install-docs: $(VENV)/installed-docs
 
 demo: install
 	$(BIN)/hostlens demo
@@ -74,6 +82,10 @@ tables: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence_growth
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.source_grid
 
+docs: install-docs
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m sphinx -q -W --keep-going -b html docs build/docs
+	@echo "build/docs/index.html"
+
 clean:
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist docs/_outside
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

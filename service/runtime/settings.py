@@ -247,7 +247,7 @@ def _require_known(settings: frozenset[str]) -> None:
             continue
         if name not in known and not _LINK.search(name) and not ("://" in value and name.endswith("_PORT")):
             near = get_close_matches(name, known, 1, 0.75)
-            hint = f": did you mean {near[0]}?" if near else "; docs/service.md lists the settings"
+            hint = f": did you mean {near[0]}?" if near else "; docs/reference/settings.md lists them"
             raise ValueError(f"{variable} is not a setting of hostlens{hint}")
         if name in settings | {"HOSTLENS_URL"} and not value.strip():
             raise ValueError(f"{variable} is empty: give it a value, or unset it for the default")

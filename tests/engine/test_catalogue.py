@@ -299,8 +299,8 @@ def in_polygon(polygon, points):
 )
 def test_the_agn_of_sdss1206_is_double_and_a_part_of_its_host_quadruple(r_eff, n, share):
     # The paper says that most of the host is quadruply imaged. Of a Sersic host centred on an AGN just outside the
-    # astroid that cannot be more than about a tenth (docs/simulation.md); the share is held here so that nobody
-    # believes more. 20,000 points: the sampling error is below 0.002.
+    # astroid it cannot be more than about a tenth (docs/reference/catalogue.md), which is what this holds. With 20,000
+    # points the sampling error is below 0.002.
     scene = build_scene(Realization(system="SDSS1206", l_eta=1.0, host=Host(n=n, r_eff=r_eff, magnitude=20.5)))
     assert len(scene.agn) == 2
     polygon = astroid(scene.lens)

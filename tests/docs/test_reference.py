@@ -1,0 +1,38 @@
+"""Tables of the reference say what the code says."""
+
+from __future__ import annotations
+
+import json
+import re
+
+from pydantic_core import PydanticUndefined
+
+from service.domain.states import TRANSITIONS, RunState
+from service.runtime.settings import Settings
+from tests.docs.openapi import FILE, document_text
+from tests.docs.pages import ROOT
+
+
+def test_the_committed_openapi_document_is_that_of_the_application() -> None:
+    assert FILE.read_text() == document_text(), "write it anew: python -m tests.docs.openapi"
+
+
+def test_every_setting_is_listed_with_its_default() -> None:
+    text = (ROOT / "docs" / "reference" / "settings.md").read_text()
+    listed = dict(re.findall(r"^\| `(HOSTLENS_\w+)` \| ([^|]+?) \|", text, re.MULTILINE))
+    fields = {f"HOSTLENS_{name.upper()}": field for name, field in Settings.model_fields.items()}
+    assert listed.keys() == fields.keys()
+    for name, field in fields.items():
+        told = listed[name]
+        if not told.startswith("`"):
+            assert field.default is None, f"{name} has a default"
+            continue
+        default = field.default_factory() if field.default is PydanticUndefined else field.default
+        said = json.dumps(default) if isinstance(default, bool | list) else str(default)
+        assert told.strip("`") in (said, said.removesuffix(".0")), f"{name} is {said} without a setting"
+
+
+def test_the_picture_of_the_states_has_every_state_and_transition() -> None:
+    picture = (ROOT / "docs" / "images" / "states.svg").read_text()
+    words = re.findall(r"<text[^>]*>([^<]+)</text>", picture)
+    assert set(words) == set(RunState) | set(TRANSITIONS) | {"submit"}
