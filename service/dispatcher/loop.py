@@ -25,7 +25,7 @@ from service.dispatcher.heartbeat import Heartbeat
 from service.dispatcher.outcomes import OtherEngine, overdue, read_artefacts, read_exception, read_part
 from service.dispatcher.pickle_guard import read_error
 from service.dispatcher.placement import Slots
-from service.dispatcher.pool import Pool, Worker, is_lost
+from service.dispatcher.pool import Pool, Worker, forget, is_lost
 from service.dispatcher.telemetry import DispatcherMetrics
 from service.dispatcher.writer import Writer
 from service.domain.payload import ResultPayload
@@ -405,7 +405,7 @@ class Dispatcher:
                 elif now - flight.missed > _GONE_S and not flight.future.done():
                     # Long enough for Dask to have said that the worker died with this run, if it had.
                     self._blame.lose([self._remove(key)], "the worker is gone")
-                    flight.future.cancel()
+                    forget(flight.future)
         self._blame.judge(self._pool)
 
     def _replace_stalled(self) -> None:
@@ -458,7 +458,7 @@ class Dispatcher:
         for key, flight in list(self._flights.items()):
             if stranded or is_lost(flight.future):
                 self._blame.lose([self._remove(key)], "no workers" if stranded else "unknown to Dask")
-                flight.future.cancel()
+                forget(flight.future)
             elif now - flight.started > self._settings.deadline_s:
                 ending = overdue(self._settings.deadline_s)
                 overdue_flights.append(self._remove(key))

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 from uuid import uuid4
 
+from distributed.client import ClosedClientError
+
 from service.dispatcher.clusters import open_client
 from service.dispatcher.pickle_guard import read_error
 from service.dispatcher.stalls import LOOK_S, Asked, Condition, Stall, Stalls, WorkerMemory, read_conditions
@@ -180,16 +182,20 @@ class Pool:
             raise OSError(f"the scheduler cannot be asked: {error}") from error
 
     def _on(self, address: str, key: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        return self._client.submit(
-            function,
-            self._settings.task,
-            *arguments,
-            key=key,
-            workers=[address],
-            allow_other_workers=False,
-            pure=False,
-            retries=0,
-        )
+        """The future of a call on a worker; OSError where the scheduler has gone."""
+        try:
+            return self._client.submit(
+                function,
+                self._settings.task,
+                *arguments,
+                key=key,
+                workers=[address],
+                allow_other_workers=False,
+                pure=False,
+                retries=0,
+            )
+        except ClosedClientError as error:
+            raise OSError(f"the scheduler cannot be given anything: {error}") from error
 
     def _look(self) -> None:
         now = time.monotonic()
@@ -249,7 +255,7 @@ class Pool:
 
     def _stop(self, addresses: list[str], futures: list[Any]) -> None:
         # KeyError: a worker that is gone.
-        with suppress(TimeoutError, OSError, KeyError, NotPlainError):
+        with suppress(TimeoutError, OSError, KeyError, NotPlainError, ClosedClientError):
             if futures:
                 self._client.cancel(futures, force=True)
             if not addresses:
@@ -265,6 +271,13 @@ class Pool:
 async def _die() -> None:
     # A coroutine, since Dask waits for the answer of everything else.
     os._exit(1)
+
+
+def forget(future: Any) -> None:
+    """Let Dask forget a run."""
+    # Its client closes itself when the scheduler is gone, and this may be the moment.
+    with suppress(ClosedClientError):
+        future.cancel()
 
 
 def is_lost(future: Any) -> bool:
