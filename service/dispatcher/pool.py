@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.leases import Lease
 from service.worker.answers import NotPlainError, read_greeting
-from service.worker.tasks import call_tasks, greet
+from service.worker.tasks import answer_run, greet
 
 _LOG = logging.getLogger(__name__)
 _STOP_S = 5.0
@@ -61,8 +61,7 @@ class Pool:
         self._greetings: dict[str, Asked] = {}
         self._refused: set[str] = set()
         self._conditions: dict[str, Condition] = {}
-        self._patience_s = settings.worker_patience_s
-        self._stalls = Stalls(settings.worker_ttl_s, self._patience_s)
+        self._stalls = Stalls(settings.worker_ttl_s, settings.worker_patience_s)
         self._conditions_due = float("-inf")
         self._unfit: list[tuple[float, Stall]] = []
         self._failures = 0
@@ -127,11 +126,10 @@ class Pool:
         except (OSError, NotPlainError, TypeError, ValueError, KeyError):
             return None
 
-    def submit(self, leases: Sequence[Lease], worker: Worker) -> Any:
-        """Start runs, one after the other as one task; the future of their answers, in the same order."""
-        specs = [lease.spec for lease in leases]
-        fields = [logs.fields_of(lease) for lease in leases]
-        return self._on(worker.address, leases[0].key, call_tasks, specs, self._settings.artefacts, fields)
+    def submit(self, lease: Lease, worker: Worker) -> Any:
+        """Start a run; the future of its answer."""
+        fields = logs.fields_of(lease)
+        return self._on(worker.address, lease.key, answer_run, lease.spec, self._settings.artefacts, fields)
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""
@@ -154,7 +152,7 @@ class Pool:
         self._workers.pop(address, None)
 
     def closed_on_purpose(self, address: str) -> bool:
-        """Whether a worker that is gone was told to go (a signal, the end of its lifetime) and did not die."""
+        """Whether a worker that is gone was told to go (by a signal, say) and did not die."""
         try:
             events = self._client.get_events(address)
         except (OSError, TimeoutError, NotPlainError, RuntimeError):
@@ -225,8 +223,7 @@ class Pool:
     def _greet(self, address: str, threads: int, now: float, passed: float) -> None:
         """Ask a new worker what it carries; until it has answered it gets no run, and if it does not it is replaced."""
         if address not in self._greetings:
-            greeting = self._on(address, f"greet-{uuid4().hex}", greet)
-            self._greetings[address] = Asked(greeting, now, self._patience_s)
+            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet), now)
         asked = self._greetings[address]
         if not asked.future.done():
             if asked.has_stalled(self._conditions.get(address), passed, now):
@@ -271,13 +268,6 @@ class Pool:
 async def _die() -> None:
     # A coroutine, since Dask waits for the answer of everything else.
     os._exit(1)
-
-
-def forget(future: Any) -> None:
-    """Let Dask forget a run."""
-    # Its client closes itself when the scheduler is gone, and this may be the moment.
-    with suppress(ClosedClientError):
-        future.cancel()
 
 
 def is_lost(future: Any) -> bool:

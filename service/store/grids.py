@@ -13,6 +13,7 @@ from sqlalchemy import Connection, Row, bindparam, false, func, select, update
 from sqlalchemy.exc import IntegrityError
 
 from service.domain.identifiers import utc_now
+from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
@@ -29,7 +30,7 @@ from service.store.rows import (
     run_view,
 )
 from service.store.settling import IS_OPEN, settle
-from service.store.submission import Plan, Submission, give_up, store
+from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
 from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 

@@ -13,7 +13,6 @@ import sys
 import time
 import traceback
 from base64 import b64encode
-from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -35,24 +34,19 @@ _FIRST_COLD = "parametric"
 """Stage of the engine before which a warm-up ends: nearly all that is slow the first time is in the one before."""
 
 
-def call_tasks(
-    task: str, specs: Sequence[dict[str, Any]], artefact_url: str, fields: Sequence[logs.Fields] = ()
-) -> bytes:
-    """Run the task for one specification after the other; :class:`service.worker.answers.Answers`, in the same order.
+def answer_run(task: str, spec: dict[str, Any], artefact_url: str, fields: logs.Fields | None = None) -> bytes:
+    """Run the task for a specification; :class:`service.worker.answers.Answer`.
 
-    The dispatcher submits this function, so that it need not import the engine itself. Short runs come several at a
-    time: what Dask does for each task would take longer than they do. ``fields``, if given, has for each specification
-    what goes on every line that is logged meanwhile.
+    The dispatcher submits this function, so that it need not import the engine itself. ``fields`` go on every line
+    that is logged meanwhile.
     """
-    answers = []
     _running.append(None)
     try:
-        for place, spec in enumerate(specs):
-            with logs.bound(**(fields[place] if fields else {})):
-                answers.append(_plain(call_task(task, spec, artefact_url)))
+        with logs.bound(**(fields or {})):
+            answer = _plain(call_task(task, spec, artefact_url))
     finally:
         _running.pop()
-    return b'{"answers":[%b],"memory":%d}' % (b",".join(answers), _memory())
+    return b'{"answer":%b,"memory":%d}' % (answer, _memory())
 
 
 def _plain(answer: dict[str, Any]) -> bytes:

@@ -34,7 +34,7 @@ from engine.spec.analysis import Analysis
 from service.api.app import create_app
 from service.cli.app import app
 from service.dispatcher.identity import is_dead, own_name
-from service.dispatcher.outcomes import OtherEngine, clean, read_answer, read_exception
+from service.dispatcher.outcomes import OtherEngine, clean, judge_answer, read_exception
 from service.dispatcher.pickle_guard import read_error
 from service.domain.identifiers import utc_now
 from service.domain.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
@@ -43,8 +43,8 @@ from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
-from service.worker.answers import LIMIT_BYTES, NotPlainError, read_answers, to_bytes
-from service.worker.tasks import call_task, call_tasks, execute
+from service.worker.answers import LIMIT_BYTES, NotPlainError, read_answer, to_bytes
+from service.worker.tasks import answer_run, call_task, execute
 from tests.service.plans import planned
 from tests.service.tasks import PNG, synthetic_payload
 
@@ -134,16 +134,16 @@ def test_a_worker_answers_with_data_whatever_happens() -> None:
 
 def test_answers_are_judged() -> None:
     good = {"payload": synthetic_payload(SPEC)}
-    assert read_answer(lease(), good) == read_payload(good["payload"])
+    assert judge_answer(lease(), good) == read_payload(good["payload"])
     for answer in (None, {}, {"payload": {}}, {"payload": {**good["payload"], "realization_digest": "0" * 64}}):
-        ending = read_answer(lease(), answer)
+        ending = judge_answer(lease(), answer)
         assert isinstance(ending, Failure)
         assert (ending.code, ending.retries) == ("invalid_result", 0)
     assert read_exception(ValueError("x")).outcome is Outcome.ERROR
     mine = dataclasses.replace(lease(), engine="e" * 64)
-    assert read_answer(mine, {**good, "engine": "e" * 64}) == read_payload(good["payload"])
-    assert read_answer(mine, {**good, "engine": "f" * 64}) == OtherEngine("f" * 64)
-    assert read_answer(mine, good) == OtherEngine("None")
+    assert judge_answer(mine, {**good, "engine": "e" * 64}) == read_payload(good["payload"])
+    assert judge_answer(mine, {**good, "engine": "f" * 64}) == OtherEngine("f" * 64)
+    assert judge_answer(mine, good) == OtherEngine("None")
     assert clean("a\x00b\ud800") == "a\ufffdb?"
 
 
@@ -249,24 +249,24 @@ def test_a_worker_is_greeted_with_its_engine_one_thread_and_warm_kernels() -> No
 
 
 def test_answers_of_workers_are_plain_data_of_a_bounded_size_and_nothing_else() -> None:
-    good = {"answers": [{"payload": {}, "engine": "e"}, {"error": {}}], "memory": 7}
-    assert read_answers(to_bytes(good), 2).memory == 7
+    good = {"answer": {"payload": {}, "engine": "e"}, "memory": 7}
+    assert read_answer(to_bytes(good)).memory == 7
     wrong: tuple[object, ...] = (
         good,
         to_bytes(good).decode(),
         pickle.dumps(good),
         b"",
         b"[" * 100_000,
-        b'{"answers":[' + b"9" * 10_000 + b"]}",
-        to_bytes({**good, "answers": good["answers"] * 2}),
-        to_bytes({**good, "answers": [1, 2]}),
+        b'{"answer":' + b"9" * 10_000 + b"}",
+        to_bytes({"memory": 7}),
+        to_bytes({**good, "answer": [1, 2]}),
         to_bytes({**good, "more": 1}),
         to_bytes({**good, "memory": -1}),
-        b" " * (3 * LIMIT_BYTES + 1),
+        b" " * (2 * LIMIT_BYTES + 1),
     )
     for said in wrong:
         with pytest.raises(NotPlainError):
-            read_answers(said, 2)
+            read_answer(said)
 
 
 def test_what_a_task_answers_leaves_the_worker_as_plain_data_or_as_an_error_that_says_why(
@@ -274,11 +274,12 @@ def test_what_a_task_answers_leaves_the_worker_as_plain_data_or_as_an_error_that
 ) -> None:
     answers: dict[str, Any] = {"object": object(), "huge": "x" * LIMIT_BYTES, "well": 1}
     monkeypatch.setattr("tests.service.tasks.fast", lambda spec, _: answers[spec])
-    said = read_answers(call_tasks("tests.service.tasks:fast", list(answers), str(tmp_path)), 3)  # type: ignore[arg-type]
-    assert [answer.get("error", {}).get("code") for answer in said.answers] == ["invalid_result"] * 2 + [None]
-    assert said.memory > 0
+    task = "tests.service.tasks:fast"
+    said = [read_answer(answer_run(task, spec, str(tmp_path))) for spec in answers]  # type: ignore[arg-type]
+    assert [one.answer.get("error", {}).get("code") for one in said] == ["invalid_result"] * 2 + [None]
+    assert all(one.memory > 0 for one in said)
     monkeypatch.setattr("tests.service.tasks.fast", _no_memory)
-    (answer,) = read_answers(call_tasks("tests.service.tasks:fast", [{}], str(tmp_path)), 1).answers
+    answer = read_answer(answer_run(task, {}, str(tmp_path))).answer
     assert answer["error"]["code"] == "memory"
 
 
