@@ -200,7 +200,7 @@ def compare(seed: int, *, inversion: bool) -> dict[str, Any]:
     except EngineError as error:
         seconds = time.perf_counter() - began
         return {**record, "error": str(error), "wrong": [f"{type(error).__name__}: {error}"], "seconds": seconds}
-    values = {name: getattr(found.host, name) for name in ("magnitude", "radius", "n")}
+    values = {"magnitude": found.host.magnitude, "radius": found.host.r_eff, "n": found.host.n}
     values |= {name: found.lens[name] for name in _LENS}
     wrong = [] if len(found.agn) == record["agn"] else [f"{len(found.agn)} AGN images of {record['agn']}"]
     low, high = values["magnitude"].interval95

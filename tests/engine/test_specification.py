@@ -1,6 +1,7 @@
 """Specifications, the catalogue and grids: what is accepted, what is refused and how it is told."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -252,6 +253,25 @@ def test_magnitudes_and_rates_go_there_and_back() -> None:
     assert rate_to_magnitude(magnitude_to_rate(21.3, 25.9463), 25.9463) == pytest.approx(21.3)
     with pytest.raises(ValueError, match="rate"):
         rate_to_magnitude(0.0, 25.9)
+
+
+def test_estimators_are_left_out_where_all_are_wanted_and_have_one_order() -> None:
+    assert "estimators" not in HE0435.to_dict()["analysis"]
+    one, other = (
+        replace(HE0435, analysis=Analysis(estimators=names)) for names in (("image", "paper"), ("paper", "image"))
+    )
+    assert one.to_dict()["analysis"]["estimators"] == ["paper", "image"]
+    assert one.digest == other.digest != HE0435.digest
+    assert realization_from_dict(one.to_dict()) == one
+    assert one.observation_digest == HE0435.observation_digest
+    # The digest of this specification before there was the field.
+    assert HE0435.digest == "a89bc559c7ef9ce4b565071fab827c4f2eb82c037a4f5b999a4a02a9d5eb34a1"
+
+
+@pytest.mark.parametrize("names", [[], ["image", "image"], ["galfit"]])
+def test_estimators_that_make_no_sense_are_refused(names: list[str]) -> None:
+    with pytest.raises(SpecError, match="estimators"):
+        realization_from_dict(HE0435.to_dict() | {"analysis": {"estimators": names}})
 
 
 def test_the_engine_digest_is_a_sha256_and_stays() -> None:
