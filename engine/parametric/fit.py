@@ -25,7 +25,7 @@ from engine.parametric.model import ImageModel
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
-from engine.parametric.search import Acceptance, Task, find_starts, prepare_task, quick_fits, varied_starts
+from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
 from engine.parametric.solution import Solution
 from engine.parametric.uncertainty import host_posteriors, parameter_covariance
 from engine.result import IndexPrior
@@ -120,7 +120,7 @@ def fit_parametric(
         raise SpecError("agn_images", agn_images, "a number from 0 to 8")
     if theta_E is not None and not 0 < theta_E < radius:
         raise SpecError("theta_E", theta_E, f"a radius on the image, below {radius:g}")
-    task = prepare_task(observation, deflector=deflector, shear=shear, acceptance=acceptance, priors=priors)
+    task = Task(observation, deflector, shear, acceptance, priors)
     groups = find_starts(task, agn_images, theta_E, positions)
     refusals: list[str] = []
     for wave in (groups, [varied_starts(group) for group in groups]):

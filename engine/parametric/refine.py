@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +47,11 @@ def ranked(task: Task, groups: list[list[Solution]]) -> list[Solution]:
     each number of them that is not out of the question, and that without, are compared as fits of full accuracy
     on one noise map.
     """
-    best = sorted((min(group, key=_information) for group in groups if group), key=_information)
+    best = sorted(
+        (min(group, key=attrgetter("information")) for group in groups if group), key=attrgetter("information")
+    )
     if len(best) == 1:
-        return sorted((solution for group in groups for solution in group), key=_information)[:2]
+        return sorted((solution for group in groups for solution in group), key=attrgetter("information"))[:2]
     with_agn = [solution for solution in best if solution.space.n_agn]
     chosen = [solution for solution in best if not solution.space.n_agn]
     chosen += [s for s in with_agn if s.information < _RIVAL * with_agn[0].information]
@@ -56,7 +59,7 @@ def ranked(task: Task, groups: list[list[Solution]]) -> list[Solution]:
         return best[:2]
     sigma = _sigma(task, with_agn[0] if with_agn else chosen[0])
     full = [_full(task, solution, sigma, shear=task.may_shear) for solution in chosen]
-    return sorted(full, key=_information)[:2]
+    return sorted(full, key=attrgetter("information"))[:2]
 
 
 def polished(task: Task, solution: Solution) -> Solution:
@@ -71,10 +74,6 @@ def polished(task: Task, solution: Solution) -> Solution:
     for _ in range(task.observation.optics.correction_rounds):
         best = _again(best, best.model.corrected(best.values))
     return best
-
-
-def _information(solution: Solution) -> float:
-    return solution.information
 
 
 def _full(task: Task, solution: Solution, sigma: FloatArray, *, shear: bool) -> Solution:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -47,8 +48,7 @@ class Acceptance:
 class Task:
     """What is fitted: an observation, what the model may have, and what is known.
 
-    ``shear`` is None where the fit has to tell whether there is any. ``image`` and ``noise`` (ny, nx) are those of the
-    observation with its gaps filled; ``centre`` [arcsec] is where the deflector shines.
+    ``shear`` is None where the fit has to tell whether there is any.
     """
 
     observation: Observation
@@ -56,9 +56,23 @@ class Task:
     shear: bool | None
     acceptance: Acceptance
     priors: Mapping[LensParameterName, ParameterPrior]
-    image: FloatArray
-    noise: FloatArray
-    centre: tuple[float, float]
+
+    @cached_property
+    def image(self) -> FloatArray:
+        """The image (ny, nx) with its gaps filled."""
+        return filled_image(self.observation)
+
+    @cached_property
+    def noise(self) -> FloatArray:
+        """The noise map (ny, nx) with its gaps filled."""
+        valid, noise = self.observation.valid, self.observation.noise
+        return np.where(valid, noise, float(np.median(noise[valid])))
+
+    @cached_property
+    def centre(self) -> tuple[float, float]:
+        """Where the deflector shines [arcsec]; the middle, where its light shows nowhere near it."""
+        shining = deflector_centre(self.image, self.observation.pixel_scale) if self.deflector else None
+        return (0.0, 0.0) if shining is None else shining
 
     @property
     def may_shear(self) -> bool:
@@ -70,23 +84,6 @@ class Task:
         return find_point_sources(
             self.image, self.noise, self.observation.psf, self.observation.pixel_scale, most, self.centre
         )
-
-
-def prepare_task(
-    observation: Observation,
-    *,
-    deflector: bool,
-    shear: bool | None,
-    acceptance: Acceptance,
-    priors: Mapping[LensParameterName, ParameterPrior],
-) -> Task:
-    """Look where the deflector is, and fill the gaps of the image."""
-    image = filled_image(observation)
-    noise = np.where(observation.valid, observation.noise, float(np.median(observation.noise[observation.valid])))
-    shining = deflector_centre(image, observation.pixel_scale) if deflector else None
-    # A lens whose light shows nowhere near the middle is looked for there all the same.
-    centre = (0.0, 0.0) if shining is None else shining
-    return Task(observation, deflector, shear, acceptance, priors, image, noise, centre)
 
 
 def find_starts(

@@ -24,7 +24,7 @@ from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import find_point_sources
 from engine.parametric.refine import polished
 from engine.parametric.residual_noise import measured_stamp_error
-from engine.parametric.search import Task, find_starts, prepare_task, quick_fits
+from engine.parametric.search import Task, find_starts, quick_fits
 from engine.parametric.starts import ring_radii
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
@@ -229,7 +229,7 @@ def test_residuals_that_no_stamp_explains_change_its_error_by_no_more_than_is_al
 
 
 def task_of(observation: Observation) -> Task:
-    return prepare_task(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
+    return Task(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
 
 
 def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulation: Simulation) -> None:
@@ -259,7 +259,8 @@ def test_what_strays_from_its_start_fit_by_fit_is_told(simulation: Simulation, n
     away[k] = low[k] + 0.01 * (high[k] - low[k])
     assert name not in replace(found, values=away).at_bound
     away[k] = low[k] - 0.1 * (high[k] - low[k])
-    own_low, own_high = space.bounds(away, simulation.observation.pixel_scale, {})
+    own_low, own_high = found.low.copy(), found.high.copy()
+    own_low[k], own_high[k] = away[k] - 1.0, away[k] + 1.0
     again = replace(found, values=away, low=own_low, high=own_high)
     assert not space.at_bound(away, own_low, own_high)
     assert again.at_bound == (name,)
