@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.resources import files
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from engine import digest
 from engine.catalogue import (
     camera_names,
     load_camera,
@@ -272,6 +274,12 @@ def test_estimators_are_left_out_where_all_are_wanted_and_have_one_order() -> No
 def test_estimators_that_make_no_sense_are_refused(names: list[str]) -> None:
     with pytest.raises(SpecError, match="estimators"):
         realization_from_dict(HE0435.to_dict() | {"analysis": {"estimators": names}})
+
+
+def test_another_picture_of_the_same_numbers_is_no_other_engine() -> None:
+    names = [name for name, _ in digest._walk(files("engine"))]
+    assert {"lensing/power_law.py", "catalogue/systems.yaml", "run.py"} <= set(names)
+    assert not [name for name in names if name.startswith("figures/")]
 
 
 def test_the_engine_digest_is_a_sha256_and_stays() -> None:
