@@ -41,7 +41,7 @@ def _walk(folder: Traversable, prefix: str = "") -> list[tuple[str, Traversable]
 
 @cache
 def engine_digest() -> str:
-    """SHA-256 (hex) over the engine's source and data files but its figures, and the versions of its numeric packages."""
+    """SHA-256 (hex) over the engine's source and data files, figures left out, and versions of its numeric packages."""
     digest = hashlib.sha256()
     for name, entry in _walk(files("engine")):
         digest.update(name.encode() + b"\0" + entry.read_bytes() + b"\0")
