@@ -43,8 +43,8 @@ class ParametricFit:
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, all other parameters free,
     multiplied by chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma``
     (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
-    times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host with
-    each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of everything and
+    times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
+    with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
     of the lensed host [e-/s].
     """
 
