@@ -1,7 +1,7 @@
-"""The strength of HE0435's regularisation: factorisations and time beside Brent's method, after their answers agree.
+"""The strength of HE0435's regularisation: factorisations and time beside a search of ln Z, after their answers agree.
 
-Brent's method is what the engine used before: eleven evaluations of a grid 60 wide in ln lambda, then a bounded search
-to 0.01. Both start from F and D, which do not depend on lambda.
+The search takes eleven evaluations of a grid 60 wide in ln lambda, then a bounded one to 0.01; the engine looks for the
+zero of the derivative. Both start from F and D, which do not depend on lambda.
 """
 
 import math
@@ -35,7 +35,7 @@ MODELS = (
 )
 
 
-def brent(likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel) -> tuple[float, int]:
+def search(likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel) -> tuple[float, int]:
     """Ln lambda and the number of factorisations."""
     f, d = normal_equations(likelihood, lens, model)
     count = 0
@@ -93,17 +93,17 @@ def main() -> None:
         observation = simulate(scene, "author", np.random.default_rng(0)).observation
         likelihood = prepare_problem(observation, fit_parametric(observation, agn_images=4), Analysis()).likelihood
         lens = scene.lens
-        print(f"{'':>24} {'Brent':>20} {'Newton':>20}")
+        print(f"{'':>24} {'search of ln Z':>20} {'zero of slope':>20}")
         for model in MODELS:
-            newton = find_strength(likelihood, lens, model)
-            old, count = brent(likelihood, lens, model)
-            assert abs(old - newton.ln_lambda) < 2e-2, (old, newton)
+            zero = find_strength(likelihood, lens, model)
+            old, count = search(likelihood, lens, model)
+            assert abs(old - zero.ln_lambda) < 2e-2, (old, zero)
             times = (
-                least(lambda model=model: brent(likelihood, lens, model), 3),
+                least(lambda model=model: search(likelihood, lens, model), 3),
                 least(lambda model=model: find_strength(likelihood, lens, model), 3),
             )
             name = f"{model.regularisation} {model.shape[0]}x{model.shape[1]}"
-            counts = (count, newton.factorisations)
+            counts = (count, zero.factorisations)
             cells = " ".join(f"{k:>4} x {t * 1e3:9.0f} ms " for k, t in zip(counts, times, strict=True))
             print(f"{name:>24} {cells}")
         model = MODELS[0]
