@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.runtime import installation as runtime
-from service.runtime.installation import DidNotHappenError as DrillError
 from service.runtime.installation import PATIENCE_S, eventually, free_port, is_worker
+from service.runtime.installation import DidNotHappenError as DrillError
 
 __all__ = ["PATIENCE_S", "ROOT", "DrillError", "Installation", "eventually", "free_port", "installation", "is_worker"]
 
