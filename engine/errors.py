@@ -54,3 +54,11 @@ class InversionError(EngineError, ArithmeticError):
 
 class PosteriorError(EngineError, ArithmeticError):
     """No starting point with a finite posterior was found, or the chain cannot be run from it."""
+
+
+class FigureError(EngineError, ValueError):
+    """A figure cannot be drawn from what it was given; the message says what it got and what is allowed."""
+
+
+class NothingToShowError(FigureError):
+    """No result is left to draw: none was given, or none of them has what the figure shows."""

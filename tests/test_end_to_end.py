@@ -6,9 +6,8 @@ import signal
 from pathlib import Path
 
 from engine import Analysis, Grid, expand, run
-from service.store.database import Database
+from tests.drills.stored import read_records
 from tests.service.service_process import eventually, serving
-from tests.service.test_processes import stored_once
 
 QUICK = Analysis(source_pixels=(12, 12), max_steps=10, draws=4)
 VALUES = {"n": (2.0, 4.0), "magnitude": (20.5, 21.5), "l_eta": (1.0,), "r_eff": (0.39,)}
@@ -29,15 +28,14 @@ def test_a_grid_of_the_paper_survives_a_kill_and_its_biases_are_those_of_the_eng
         os.kill(killed.pid, signal.SIGKILL)
         ended = service.client.wait(grid.id, timeout_s=300)
         assert ended.counts.done == 4
-        database = Database(url)
-        assert stored_once(database, grid.id) == 4
-        database.close()
+        found = read_records(url, grid.id)
+        assert (found.states, found.stored) == ({"done": 4}, 4)
         summary = service.client.summary(grid.id)
         runs = list(service.client.runs(grid.id))
         figures = [service.client.run(found.id).result for found in runs]
         assert all(found is not None and found.figure is not None for found in figures)
         assert service.end() == 0
-        assert service.processes() == []
+        eventually(lambda: service.processes() == [], what="the end of all processes")
     # What the database says of the first run is what the engine says, to the last bit.
     first = expand(Grid(preset="h0licow-vi/HE0435", analysis=QUICK, **VALUES))[0]
     direct = run(first.realization)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from itertools import islice
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
@@ -72,10 +72,10 @@ def list_grids(
     return page.model_copy(update={"next": next_link(request, response, page.next)})
 
 
-@router.get("/grids/{grid_id}")
-def show_grid(grid_id: GridId, service: Service) -> GridView:
+@router.get("/grids/{grid_id}", response_model=GridView)
+def show_grid(grid_id: GridId, service: Service) -> Response:
     """One grid: its runs by state, rate and time left."""
-    return service.grids.grid(grid_id)
+    return _written(service.grids.grid(grid_id))
 
 
 @router.get("/grids/{grid_id}/runs")
@@ -105,8 +105,12 @@ def summary(
     """Recovered values and biases by input, and over the whole grid."""
     found = service.grids.summary(grid_id, limit, cursor)
     found["next"] = next_link(request, response, found["next"])
-    # Written at once: by way of the model every number of the page would be checked before.
-    return Response(to_json(found), media_type="application/json", headers=dict(response.headers))
+    return _written(found, dict(response.headers))
+
+
+def _written(document: Any, headers: dict[str, str] | None = None) -> Response:
+    """Plain data, written at once: by way of its model every number would be checked before."""
+    return Response(to_json(document), media_type="application/json", headers=headers)
 
 
 @router.post("/grids/{grid_id}/cancel")
@@ -134,10 +138,10 @@ def retry(grid_id: GridId, service: Service) -> GridView:
     return service.grids.grid(grid_id)
 
 
-@router.get("/runs/{run_id}")
-def show_run(run_id: RunId, service: Service) -> RunDetail:
+@router.get("/runs/{run_id}", response_model=RunDetail)
+def show_run(run_id: RunId, service: Service) -> Response:
     """One run: specification, state, result, attempts."""
-    return service.grids.run(run_id)
+    return _written(service.grids.run_document(run_id))
 
 
 @router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]

@@ -59,7 +59,8 @@ class Pool:
         self._greetings: dict[str, Asked] = {}
         self._refused: set[str] = set()
         self._conditions: dict[str, Condition] = {}
-        self._stalls = Stalls(settings.worker_ttl_s)
+        self._patience_s = settings.worker_patience_s
+        self._stalls = Stalls(settings.worker_ttl_s, self._patience_s)
         self._conditions_due = float("-inf")
         self._unfit: list[tuple[float, Stall]] = []
         self._failures = 0
@@ -218,7 +219,8 @@ class Pool:
     def _greet(self, address: str, threads: int, now: float, passed: float) -> None:
         """Ask a new worker what it carries; until it has answered it gets no run, and if it does not it is replaced."""
         if address not in self._greetings:
-            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet), now)
+            greeting = self._on(address, f"greet-{uuid4().hex}", greet)
+            self._greetings[address] = Asked(greeting, now, self._patience_s)
         asked = self._greetings[address]
         if not asked.future.done():
             if asked.has_stalled(self._conditions.get(address), passed, now):

@@ -13,11 +13,9 @@ from typing import Any
 from service.worker.answers import RUNNING
 
 LOOK_S = 2.0
-PATIENCE_S = 20.0
-"""How long a worker may take no work. Dask pauses and closes workers for moments, and a run may be about to end."""
-GREETING_S, BUSY_GREETING_S = 40.0, 600.0
-"""How long a greeting may take where the worker's processor idles, and where it works: cold kernels take minutes on a
-machine that is busy with other things."""
+_GREETING, _BUSY_GREETING = 2.0, 30.0
+"""How much longer than to take work a greeting may take where the worker's processor idles, and where it works: cold
+kernels take minutes on a machine that is busy with other things."""
 _BUSY_PERCENT = 20.0
 _PAUSE_FRACTION = 0.8
 
@@ -108,11 +106,12 @@ class _Watched:
 class Stalls:
     """Finds the workers that take no work.
 
-    Time is counted in looks: while this process or the scheduler stood still, nobody waited for a worker.
+    Time is counted in looks: while this process or the scheduler stood still, nobody waited for a worker. For
+    ``patience_s`` one may take no work: Dask pauses and closes workers for moments, and a run may be about to end.
     """
 
-    def __init__(self, silent_s: float) -> None:
-        self._silent_s = silent_s
+    def __init__(self, silent_s: float, patience_s: float) -> None:
+        self._silent_s, self._patience_s = silent_s, patience_s
         self._watched: dict[str, _Watched] = {}
         self._looked: float | None = None
 
@@ -143,9 +142,9 @@ class Stalls:
         # Only a heartbeat tells that nothing is executed: a run that lets no other thread work keeps it from beating.
         idle = condition.executing == 0 and given_s > 0.0
         watched.idle_s = 0.0 if not idle else watched.idle_s + (unheard_s if heard else 0.0)
-        if watched.unfit_s >= PATIENCE_S:
+        if watched.unfit_s >= self._patience_s:
             return "closing" if closing else "paused"
-        if watched.idle_s >= PATIENCE_S and given_s >= PATIENCE_S:
+        if min(watched.idle_s, given_s) >= self._patience_s:
             return "not_started"
         return "silent" if watched.silent_s >= self._silent_s else None
 
@@ -156,10 +155,12 @@ class Asked:
 
     future: Any
     since: float
+    patience_s: float
     idle_s: float = 0.0
 
     def has_stalled(self, condition: Condition | None, passed: float, now: float) -> bool:
         """Whether it is no longer waited for."""
         if condition is None or condition.cpu < _BUSY_PERCENT:
             self.idle_s += passed
-        return self.idle_s >= GREETING_S or now - self.since >= BUSY_GREETING_S
+        given_s = now - self.since
+        return self.idle_s >= _GREETING * self.patience_s or given_s >= _BUSY_GREETING * self.patience_s

@@ -31,9 +31,19 @@ EstimateName = Literal[
 ]  # fmt: skip
 ESTIMATES: tuple[EstimateName, ...] = get_args(EstimateName)
 """Estimator and prior of n: wide 0.3-8, free 1-4, fixed to the truth."""
+RECOMMENDED: EstimateName = "image_wide"
+"""The estimate to quote where nobody asks for another."""
 QUANTITIES = ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y")
 COUNTS = ("draws", "at_bound", "n_at_bound", "r_eff_at_bound", "failed")
+_OF_CHAIN = ("ln_evidence", "chi2", "degrees_of_freedom", "condition_number")
+"""What a result has if it has a chain."""
 LENS_PARAMETERS = ("theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda")
+
+
+def estimator_and_prior(name: str) -> tuple[str, str]:
+    """The two parts of an estimate's name."""
+    estimator, _, prior = name.rpartition("_")
+    return estimator, prior
 
 
 class InvalidResultError(ValueError):
@@ -123,7 +133,8 @@ class ArtefactPayload(_Strict):
 class ResultPayload(_Strict):
     """Everything that is stored of one run.
 
-    Every estimate is named; one that could fit no draw is null.
+    Every estimate is named; one that could fit no draw, or was not asked for, is null. A run that asked for nothing
+    that needs a chain has none, and no evidence.
     """
 
     realization_digest: Digest
@@ -135,11 +146,11 @@ class ResultPayload(_Strict):
     estimates: dict[EstimateName, EstimatePayload | None]
     aperture: AperturePayload | None
     lens: dict[str, QuantityPayload]
-    chain: ChainPayload
-    ln_evidence: Finite
-    chi2: NonNegative
-    degrees_of_freedom: int
-    condition_number: NonNegative
+    chain: ChainPayload | None = None
+    ln_evidence: Finite | None = None
+    chi2: NonNegative | None = None
+    degrees_of_freedom: int | None = None
+    condition_number: NonNegative | None = None
     arc_magnitude: Finite
     agn_contrast: Finite | None
     surface_brightness: Finite
@@ -156,6 +167,9 @@ class ResultPayload(_Strict):
         unknown = sorted(set(self.lens) - set(LENS_PARAMETERS))
         if unknown:
             raise ValueError(f"unknown lens parameters: {', '.join(unknown)}")
+        lacking = [name for name in _OF_CHAIN if getattr(self, name) is None]
+        if self.chain is not None and lacking:
+            raise ValueError(f"a chain without {', '.join(lacking)}")
         return self
 
     @property
@@ -200,11 +214,10 @@ def result_payload(
             "estimates": {name: found.get(name) for name in ESTIMATES} | found,
             "aperture": None if result.aperture is None else _aperture(result.aperture),
             "lens": {parameter.name: _quantity(parameter.value) for parameter in result.lens},
-            "chain": {name: _plain(getattr(result.chain, name)) for name in ChainPayload.model_fields},
-            "ln_evidence": float(result.ln_evidence),
-            "chi2": float(result.chi2),
-            "degrees_of_freedom": int(result.degrees_of_freedom),
-            "condition_number": float(result.condition_number),
+            "chain": None
+            if result.chain is None
+            else {name: _plain(getattr(result.chain, name)) for name in ChainPayload.model_fields},
+            **{name: _plain(getattr(result, name)) for name in _OF_CHAIN},
             "arc_magnitude": float(result.arc_magnitude),
             "agn_contrast": None if result.agn_contrast is None else float(result.agn_contrast),
             "surface_brightness": float(result.surface_brightness),

@@ -47,6 +47,8 @@ from engine import (
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
 from service.store.submission import PlannedRun
 
+CONFIGURATIONS = {2: "double", 4: "quad"}
+"""What a lens with so many AGN images is called; any other is ``other``."""
 _CONFIG = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
@@ -197,10 +199,12 @@ def _grid(request: GridRequest) -> Grid:
 def _planned(run: GridRun) -> PlannedRun:
     realization = run.realization
     system = realization.system
-    camera = realization.camera or (load_system(system) if isinstance(system, str) else system).camera
+    lens = load_system(system) if isinstance(system, str) else system
+    camera = realization.camera or lens.camera
     inputs = {
         "system": realization.system_name,
         "camera": camera if isinstance(camera, str) else camera.name,
+        "configuration": CONFIGURATIONS.get(len(lens.agn), "other"),
         "mass_model": realization.mass_model,
         "noise_level": realization.noise_level,
         "noise_treatment": realization.analysis.noise_treatment,

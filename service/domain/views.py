@@ -197,11 +197,12 @@ class ResultView(_Answer):
     regularisation: str | None
     profile: str | None
     lens: dict[str, LensValue]
-    chain: ChainPayload
-    ln_evidence: float
-    chi2: float
-    degrees_of_freedom: int
-    condition_number: float
+    chain: ChainPayload | None
+    """Null, as are the next four, where the run needed no chain."""
+    ln_evidence: float | None
+    chi2: float | None
+    degrees_of_freedom: int | None
+    condition_number: float | None
     arc_magnitude: float
     agn_contrast: float | None
     surface_brightness: float

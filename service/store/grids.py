@@ -17,13 +17,21 @@ from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunS
 from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
-from service.store.pace import recent
+from service.store.pace import progress, recent
 from service.store.pieces import Turns
-from service.store.rows import RUN_COLUMNS, ended_grid_view, grid_view, run_detail, run_view
+from service.store.rows import (
+    ATTEMPT_COLUMNS,
+    ESTIMATE_COLUMNS,
+    RUN_COLUMNS,
+    ended_grid_view,
+    grid_view,
+    run_document,
+    run_view,
+)
 from service.store.settling import IS_OPEN, settle
 from service.store.submission import Plan, Submission, give_up, store
 from service.store.summary import summarise
-from service.store.tables import attempt, event, grid, idempotency, result, run
+from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""
@@ -37,7 +45,8 @@ _COUNTS = (
 )
 _RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
 _RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
-_ATTEMPTS = select(attempt).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
+_ESTIMATES = select(*ESTIMATE_COLUMNS).where(estimate.c.run_id == bindparam("wanted"))
+_ATTEMPTS = select(*ATTEMPT_COLUMNS).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
 
 
 class NotFoundError(LookupError):
@@ -149,13 +158,20 @@ class GridStore:
         return RunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
 
     def run(self, wanted: str) -> RunDetail:
-        """One run with result and attempts, from one picture of the database, so that they fit each other."""
+        """One run with result and attempts, checked."""
+        return RunDetail.model_validate(self.run_document(wanted))
+
+    def run_document(self, wanted: str) -> dict[str, Any]:
+        """The same as plain data, from one picture of the database, so that its parts fit each other."""
+        parameters = {"wanted": wanted}
         with self._database.read() as connection:
-            row = connection.execute(_RUN, {"wanted": wanted}).one_or_none()
+            row = connection.execute(_RUN, parameters).one_or_none()
             if row is None:
                 raise NotFoundError(f"there is no run {wanted}")
-            found = connection.execute(_RESULT, {"wanted": wanted}).one_or_none()
-            return run_detail(row, found, connection.execute(_ATTEMPTS, {"wanted": wanted}).all())
+            found = connection.execute(_RESULT, parameters).one_or_none()
+            estimates = [] if found is None else connection.execute(_ESTIMATES, parameters).all()
+            attempts = connection.execute(_ATTEMPTS, parameters).all()
+        return run_document(row, found, estimates, attempts)
 
     def cancel(self, grid_id: str) -> GridView:
         """Mark the grid, so that nothing of it is started and the dispatcher stops what is running; end what is queued.
@@ -247,7 +263,10 @@ class GridStore:
         row = connection.execute(_GRID, {"wanted": grid_id}).one_or_none()
         if row is None:
             raise NotFoundError(f"there is no grid {grid_id}")
-        return self._views(connection, [row])[0]
+        if row.ending is not None:
+            return ended_grid_view(row)
+        counts, latest = progress(connection, grid_id)
+        return grid_view(row, counts, latest, self._clock())
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()

@@ -57,7 +57,7 @@ class Lease:
     """The right to run a run once: whoever holds the token may store its result.
 
     ``engine`` is the digest of the engine whose results the grid takes (None: any); a ``suspect`` may have killed a
-    worker, and has to be run alone.
+    worker, and has to be run alone. ``kind`` says what is to be done with the specification.
     """
 
     run_id: str
@@ -70,6 +70,7 @@ class Lease:
     started_at: datetime
     engine: str | None = None
     suspect: bool = False
+    kind: str = "realization"
 
     @property
     def pair(self) -> Pair:

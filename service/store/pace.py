@@ -1,13 +1,15 @@
-"""How fast grids' runs end: measured on the latest of them."""
+"""How far grids are, and how fast their runs end: measured on the latest of them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
-from sqlalchemy import Connection, bindparam, func, select
+from sqlalchemy import Connection, Select, bindparam, func, select
 
+from service.domain.states import RunState
 from service.store.tables import grid, run
 
 _RUNS = 100
@@ -39,6 +41,32 @@ _MEASURES = (func.count(), func.min(_LATEST.c.leased_at), func.max(_LATEST.c.fin
 _MEASURED = select(grid.c.id, *(select(measure).select_from(_LATEST).scalar_subquery() for measure in _MEASURES)).where(
     grid.c.id.in_(bindparam("ids", expanding=True))
 )
+
+
+def _progress() -> Select[Any]:
+    """All that the view of one open grid needs of its runs, in one statement: each costs more than what it reads."""
+    mine = run.c.grid_id == bindparam("wanted")
+    latest = (
+        select(run.c.finished_at, run.c.leased_at)
+        .where(mine, run.c.finished_at.is_not(None), run.c.leased_at.is_not(None))
+        .order_by(run.c.finished_at.desc())
+        .limit(_RUNS)
+        .subquery()
+    )
+    counts = (
+        select(func.count()).select_from(run).where(mine, run.c.state == state).scalar_subquery() for state in RunState
+    )
+    return select(func.count(), func.min(latest.c.leased_at), func.max(latest.c.finished_at), *counts)
+
+
+_PROGRESS = _progress()
+
+
+def progress(connection: Connection, grid_id: str) -> tuple[dict[str, int], Recent | None]:
+    """Runs of one grid by state, and the latest of them."""
+    runs, began_at, ended_at, *counts = connection.execute(_PROGRESS, {"wanted": grid_id}).one()
+    latest = Recent(runs, began_at, ended_at) if runs else None
+    return dict(zip(RunState, counts, strict=True)), latest
 
 
 def recent(connection: Connection, grid_ids: Collection[str]) -> dict[str, Recent]:

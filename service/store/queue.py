@@ -34,10 +34,10 @@ from service.store.leases import (
     requeue,
     set_aside,
 )
-from service.store.results import result_row
+from service.store.results import estimate_rows, result_row
 from service.store.settling import held_grids
-from service.store.sums import add_to_sums
-from service.store.tables import attempt, grid, result, run
+from service.store.sums import add_to_inputs, add_to_moments
+from service.store.tables import attempt, estimate, grid, result, run
 from service.store.transitions import move, moving
 from service.store.upkeep import Upkeep
 
@@ -133,7 +133,7 @@ class RunQueue:
         return [
             Lease(
                 row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
-                row.engine_digest, row.suspect,
+                row.engine_digest, row.suspect, row.kind,
             )
             for row in sorted(rows, key=lambda row: (row.not_before, row.id))
         ]  # fmt: skip
@@ -180,8 +180,17 @@ class RunQueue:
         asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
         inputs = {row.id: row.inputs for row in asked}
         stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
+        for row, input_id in zip(stored, add_to_inputs(connection, stored), strict=True):
+            row["input_id"] = input_id
+        answers = [
+            answer
+            for row, (lease, payload) in zip(stored, results, strict=True)
+            for answer in estimate_rows(lease.run_id, row["input_id"], payload)
+        ]
         insert_rows(connection, result, stored)
-        add_to_sums(connection, stored)
+        if answers:
+            insert_rows(connection, estimate, answers)
+        add_to_moments(connection, stored, answers)
         add_events(
             connection,
             [new_event(lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt) for lease, _ in results],
@@ -383,6 +392,7 @@ _CLAIMED = (
     run.c.grid_id,
     run.c.attempt,
     run.c.digest,
+    run.c.kind,
     run.c.spec,
     run.c.suspect,
     run.c.not_before,

@@ -1,7 +1,10 @@
-"""One row of the result table from a payload."""
+"""Rows of a result from a payload: one of the table ``result``, and one of ``estimate`` for each answer."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
@@ -11,36 +14,37 @@ from service.domain.payload import (
     LENS_PARAMETERS,
     QUANTITIES,
     AperturePayload,
-    EstimateName,
-    EstimatePayload,
+    ChainPayload,
     ResultPayload,
+    estimator_and_prior,
 )
 from service.store.leases import Lease
 from service.store.tables import INPUT_COLUMNS
 
+_CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
+_PLAIN = (
+    "ln_evidence", "chi2", "degrees_of_freedom", "condition_number",
+    "arc_magnitude", "agn_contrast", "surface_brightness", "wall_s", "cpu_s", "engine_digest",
+    "noise_treatment", "regularisation", "profile",
+)  # fmt: skip
+_PARTS = tuple((quantity, *(f"{quantity}_{part}" for part in ("mean", "sd", "bias"))) for quantity in QUANTITIES)
 
-def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now: datetime) -> dict[str, Any]:
-    """Typed columns of a result; ``inputs`` are those of the run."""
+
+def result_row(lease: Lease, inputs: Mapping[str, Any], payload: ResultPayload, now: datetime) -> dict[str, Any]:
+    """Typed columns of a result but for ``input_id``; ``inputs`` are those of the run."""
     row: dict[str, Any] = {"run_id": lease.run_id, "grid_id": lease.grid_id, "stored_at": now}
-    row |= {name: inputs[name] for name in INPUT_COLUMNS}
-    for estimate in ESTIMATES:
-        row |= _estimate_columns(estimate, payload.estimates[estimate])
+    row |= {name: inputs[name] for name in (*INPUT_COLUMNS, "configuration")}
+    row["observation_digest"] = observation_digest(lease.spec)
     row |= _aperture_columns(payload.aperture)
     # Every row names every column, or those that are written together would lack what the first of them has not.
     for name in LENS_PARAMETERS:
         value, prefix = payload.lens.get(name), f"lens_{name.lower()}"
         for part in ("mean", "sd", "truth"):
             row[f"{prefix}_{part}"] = None if value is None else getattr(value, part)
-    chain = payload.chain.model_dump()
-    row |= {"chain_status": chain.pop("status"), **chain}
-    plain = (
-        "ln_evidence", "chi2", "degrees_of_freedom", "condition_number",
-        "arc_magnitude", "agn_contrast", "surface_brightness", "wall_s", "cpu_s", "engine_digest",
-        "regularisation", "profile",
-    )  # fmt: skip
-    row |= {name: getattr(payload, name) for name in plain}
+    chain = payload.chain
+    row |= {column: None if chain is None else getattr(chain, name) for name, column in _CHAIN.items()}
+    row |= {name: getattr(payload, name) for name in _PLAIN}
     row |= {
-        "noise_treatment": payload.noise_treatment,
         "stages": [stage.model_dump() for stage in payload.stages],
         "payload_digest": payload.digest,
         "versions": payload.versions,
@@ -53,28 +57,33 @@ def result_row(lease: Lease, inputs: dict[str, Any], payload: ResultPayload, now
     return row
 
 
-_ESTIMATE_COLUMNS = {
-    estimate: (
-        [(quantity, *(f"{estimate}_{quantity}_{part}" for part in ("mean", "sd", "bias"))) for quantity in QUANTITIES],
-        [(part, f"{estimate}_{part}") for part in COUNTS],
-    )
-    for estimate in ESTIMATES
-}
+def observation_digest(spec: Mapping[str, Any]) -> str:
+    """SHA-256 of what is observed: of a realization without its analysis."""
+    observed = {name: value for name, value in spec.items() if name != "analysis"}
+    return hashlib.sha256(json.dumps(observed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _estimate_columns(estimate: EstimateName, found: EstimatePayload | None) -> dict[str, Any]:
-    """Columns of one estimate, every one of them null where there is none."""
-    row: dict[str, Any] = {}
-    quantities, counts = _ESTIMATE_COLUMNS[estimate]
-    for quantity, mean, sd, bias in quantities:
-        value = None if found is None else getattr(found, quantity)
-        if value is None:
-            row[mean] = row[sd] = row[bias] = None
-        else:
+def estimate_rows(run_id: str, input_id: int, payload: ResultPayload) -> list[dict[str, Any]]:
+    """A row for each estimator and prior of n that has an answer."""
+    rows = []
+    for name in ESTIMATES:
+        found = payload.estimates[name]
+        if found is None:
+            continue
+        estimator, prior = estimator_and_prior(name)
+        row: dict[str, Any] = {
+            "run_id": run_id,
+            "estimator": estimator,
+            "index_prior": prior,
+            "input_id": input_id,
+        }
+        for quantity, mean, sd, bias in _PARTS:
+            value = getattr(found, quantity)
             row[mean], row[sd], row[bias] = value.mean, value.sd, value.bias
-    for part, column in counts:
-        row[column] = None if found is None else getattr(found, part)
-    return row
+        for part in COUNTS:
+            row[part] = getattr(found, part)
+        rows.append(row)
+    return rows
 
 
 def _aperture_columns(found: AperturePayload | None) -> dict[str, Any]:

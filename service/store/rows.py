@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Row, RowMapping
 
-from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload
+from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload, estimator_and_prior
 from service.domain.states import GridState, RunState
-from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunDetail, RunError, RunView
+from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunView
 from service.store.pace import Recent
-from service.store.tables import run
+from service.store.tables import attempt, estimate, run
 
 RUN_COLUMNS = tuple(
     run.c[name]
@@ -21,6 +21,22 @@ RUN_COLUMNS = tuple(
         "attempt", "suspect", "error_code", "error_detail", "finished_at",
     )
 )  # fmt: skip
+
+
+_ATTEMPT = tuple(AttemptView.model_fields)
+ATTEMPT_COLUMNS = tuple(attempt.c[name] for name in _ATTEMPT)
+# In the order in which _estimate takes them apart.
+ESTIMATE_COLUMNS = (
+    estimate.c.estimator,
+    estimate.c.index_prior,
+    *(estimate.c[f"{quantity}_{part}"] for quantity in QUANTITIES for part in ("mean", "sd", "bias")),
+    *(estimate.c[part] for part in COUNTS),
+)
+_ESTIMATES = {name: estimator_and_prior(name) for name in ESTIMATES}
+_LENS = {name: tuple(f"lens_{name.lower()}_{part}" for part in ("mean", "sd", "truth")) for name in LENS_PARAMETERS}
+_CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
+_GATHERED = ("estimates", "aperture", "regularisation", "profile", "lens", "chain")
+_PLAIN = tuple(name for name in ResultView.model_fields if name not in _GATHERED)
 
 
 def ended_grid_view(row: Row[Any]) -> GridView:
@@ -91,65 +107,71 @@ def run_view(row: Row[Any]) -> RunView:
     return RunView(**_run_fields(row))
 
 
-def run_detail(row: Row[Any], found: Row[Any] | None, attempts: Sequence[Row[Any]]) -> RunDetail:
-    """A run with all that belongs to it."""
+def run_document(
+    row: Row[Any], found: Row[Any] | None, estimates: Sequence[Row[Any]], attempts: Sequence[Row[Any]]
+) -> dict[str, Any]:
+    """A run with all that belongs to it: a :class:`service.domain.views.RunDetail` as plain data, in its order.
+
+    A result has four hundred numbers; to check each of them again takes longer than to read them.
+    """
     fields = _run_fields(row)
-    result = None if found is None else result_view(found)
-    if result is not None and result.figure is not None:
+    result = None if found is None else _result(found, estimates)
+    if result is not None and result["figure"] is not None:
         fields["links"]["figure"] = f"/v1/runs/{row.id}/figure"
-    return RunDetail(
+    return {
         **fields,
-        spec=row.spec,
-        digest=row.digest,
-        result=result,
-        attempts=[
-            AttemptView(**{name: getattr(ended, name) for name in AttemptView.model_fields}) for ended in attempts
-        ],
-    )
-
-
-def result_view(row: Row[Any]) -> ResultView:
-    """A result, its columns gathered by estimator and lens parameter."""
-    column = row._mapping
-    lens = {
-        name: {part: column[f"lens_{name.lower()}_{part}"] for part in ("mean", "sd", "truth")}
-        for name in LENS_PARAMETERS
-        if column[f"lens_{name.lower()}_mean"] is not None
+        "spec": row.spec,
+        "digest": row.digest,
+        "result": result,
+        "attempts": [dict(zip(_ATTEMPT, ended, strict=True)) for ended in attempts],
     }
-    chain = {name: column[name] for name in ChainPayload.model_fields if name != "status"}
-    plain = [name for name in ResultView.model_fields if name not in {"estimates", "aperture", "lens", "chain"}]
-    # Checked in one go: a result has a hundred recovered values, and a model made of each takes ten times as long.
-    return ResultView.model_validate(
-        {
-            "estimates": {name: _estimate(column, name) for name in ESTIMATES},
-            "aperture": _aperture(column),
-            "lens": lens,
-            "chain": chain | {"status": column["chain_status"]},
-            **{name: column[name] for name in plain},
-        }
-    )
 
 
-def _recovered(column: RowMapping, prefix: str) -> dict[str, Any] | None:
-    if column[f"{prefix}_mean"] is None:
-        return None
-    return {part: column[f"{prefix}_{part}"] for part in ("mean", "sd", "bias")}
+def _result(row: Row[Any], estimates: Sequence[Row[Any]]) -> dict[str, Any]:
+    """A result, its columns gathered by estimator and lens parameter: a :class:`service.domain.views.ResultView`."""
+    column = row._mapping
+    lens = {}
+    for name, (mean, sd, truth) in _LENS.items():
+        if column[mean] is not None:
+            lens[name] = {"mean": column[mean], "sd": column[sd], "truth": column[truth]}
+    answers = {(one.estimator, one.index_prior): _estimate(one) for one in estimates}
+    return {
+        "estimates": {name: answers.get(parts) for name, parts in _ESTIMATES.items()},
+        "aperture": _aperture(column),
+        "regularisation": row.regularisation,
+        "profile": row.profile,
+        "lens": lens,
+        "chain": None if row.chain_status is None else {name: column[place] for name, place in _CHAIN.items()},
+        **{name: column[name] for name in _PLAIN},
+    }
 
 
-def _estimate(column: RowMapping, name: str) -> dict[str, Any] | None:
-    """An estimate; None where the result has none, which shows in its magnitude."""
-    if column[f"{name}_magnitude_mean"] is None:
-        return None
-    quantities = {quantity: _recovered(column, f"{name}_{quantity}") for quantity in QUANTITIES}
-    return quantities | {part: column[f"{name}_{part}"] for part in COUNTS}
+def _estimate(row: Row[Any]) -> dict[str, Any]:
+    """A :class:`service.domain.views.EstimateView`; a quantity that is younger than the result is None."""
+    values: Iterator[Any] = iter(tuple(row)[2:])
+    found: dict[str, Any] = {}
+    for quantity in QUANTITIES:
+        mean, sd, bias = next(values), next(values), next(values)
+        found[quantity] = None if mean is None else {"mean": mean, "sd": sd, "bias": bias}
+    for part in COUNTS:
+        found[part] = next(values)
+    return found
 
 
 def _aperture(column: RowMapping) -> dict[str, Any] | None:
-    magnitude = _recovered(column, "aperture_magnitude")
-    if magnitude is None:
+    mean = column["aperture_magnitude_mean"]
+    if mean is None:
         return None
-    return {"magnitude": magnitude} | {
-        name: column[f"aperture_{name}"] for name in ("radius", "coverage", "draws", "failed")
+    return {
+        "radius": column["aperture_radius"],
+        "magnitude": {
+            "mean": mean,
+            "sd": column["aperture_magnitude_sd"],
+            "bias": column["aperture_magnitude_bias"],
+        },
+        "coverage": column["aperture_coverage"],
+        "draws": column["aperture_draws"],
+        "failed": column["aperture_failed"],
     }
 
 

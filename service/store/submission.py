@@ -38,6 +38,7 @@ class PlannedRun:
     spec: dict[str, Any]
     inputs: dict[str, Any]
     digest: str
+    kind: str = "realization"
 
 
 class Plan(Protocol):
@@ -176,6 +177,7 @@ def _run_row(grid_id: str, ordinal: int, planned: PlannedRun, now: datetime) -> 
         "ordinal": ordinal,
         "label": planned.label,
         "paper_run": planned.paper_run,
+        "kind": planned.kind,
         "spec": planned.spec,
         "inputs": planned.inputs,
         "digest": planned.digest,

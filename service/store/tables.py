@@ -1,4 +1,4 @@
-"""The tables: wide and typed, with named constraints so that Alembic can change each on every database."""
+"""The tables: typed, with named constraints so that Alembic can change each on every database."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES
+from service.domain.payload import COUNTS, LENS_PARAMETERS, QUANTITIES
 
-REVISION = "0007"
+REVISION = "0008"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -113,6 +113,8 @@ run = Table(
     Column("ordinal", Integer, nullable=False),
     Column("label", String(200), nullable=False),
     Column("paper_run", Integer),
+    # What a worker is to do with the specification.
+    Column("kind", String(16), nullable=False, server_default=text("'realization'")),
     Column("spec", JSON, nullable=False),
     Column("inputs", JSON, nullable=False),
     Column("digest", String(64), nullable=False),
@@ -134,6 +136,7 @@ run = Table(
         "state in ('queued', 'paused', 'leased', 'done', 'failed', 'quarantined', 'cancelled')",
         name="state",
     ),
+    CheckConstraint("kind in ('realization', 'image')", name="kind"),
     # A lease is a state with a token, never the one without the other.
     CheckConstraint("(state = 'leased') = (token is not null)", name="lease_has_token"),
     Index("ix_run_grid_id_state_ordinal", "grid_id", "state", "ordinal"),
@@ -193,14 +196,32 @@ def _input_columns() -> list[Column[Any]]:
     return [Column(name, types.get(name, String(64)), nullable=False) for name in INPUT_COLUMNS]
 
 
-def _estimate_columns() -> list[Column[Any]]:
-    # All null where an estimator has no answer; new quantities are null in results that are older than they.
-    columns: list[Column[Any]] = []
-    for estimate in ESTIMATES:
-        for quantity in QUANTITIES:
-            columns += [Column(f"{estimate}_{quantity}_{part}", Float) for part in ("mean", "sd", "bias")]
-        columns += [Column(f"{estimate}_{part}", Integer) for part in COUNTS]
-    return columns
+GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
+"""Runs that agree in these are runs of one input."""
+KEY_COLUMNS = (*GROUP_COLUMNS, "configuration", "regularisation", "profile", "engine_digest")
+"""All that a row of ``input`` has in common: what answers are grouped and filtered by."""
+
+# What runs can have in common: few rows where there are many seeds. Answers are grouped by the columns of this table,
+# so that another axis is one column here. Runs and seconds are added up as results come.
+input_group = Table(
+    "input",
+    metadata,
+    Column("id", SERIAL, primary_key=True, autoincrement=True),
+    Column("grid_id", ForeignKey("grid.id"), nullable=False),
+    # Made of KEY_COLUMNS by service.store.sums; some of them may be null, and nulls are never equal to a database.
+    Column("digest", String(32), nullable=False),
+    *(column for column in _input_columns() if column.name in GROUP_COLUMNS),
+    Column("configuration", String(16), nullable=False),
+    # Null where results are older than these columns, or the analysis was put together by hand.
+    Column("regularisation", String(32)),
+    Column("profile", String(32)),
+    Column("engine_digest", String(64), nullable=False),
+    Column("runs", Integer, nullable=False),
+    Column("wall_s", Float, nullable=False),
+    Column("cpu_s", Float, nullable=False),
+    UniqueConstraint("grid_id", "digest"),
+    Index("ix_input_order", "grid_id", *GROUP_COLUMNS, "id"),
+)
 
 
 def _lens_columns() -> list[Column[Any]]:
@@ -214,9 +235,12 @@ result = Table(
     metadata,
     Column("run_id", ForeignKey("run.id"), primary_key=True),
     Column("grid_id", ForeignKey("grid.id"), nullable=False, index=True),
+    Column("input_id", ForeignKey("input.id"), nullable=False),
+    # Of all that was observed: runs of one observation differ in their analysis, or in their engine.
+    Column("observation_digest", String(64), nullable=False),
     Column("stored_at", UtcDateTime, nullable=False),
     *_input_columns(),
-    *_estimate_columns(),
+    Column("configuration", String(16), nullable=False),
     *_lens_columns(),
     # Null in results that are older than these columns; the aperture also where no map has light in it.
     Column("aperture_radius", Float),
@@ -226,19 +250,21 @@ result = Table(
     Column("aperture_failed", Integer),
     Column("regularisation", String(32)),
     Column("profile", String(32)),
+    # From here on null where the run needed no chain.
     Column("r_hat", Float),
-    Column("ln_evidence", Float, nullable=False),
-    Column("chi2", Float, nullable=False),
-    Column("degrees_of_freedom", Integer, nullable=False),
-    Column("condition_number", Float, nullable=False),
-    Column("chain_status", String(16), nullable=False),
-    Column("walkers", Integer, nullable=False),
-    Column("steps", Integer, nullable=False),
-    Column("burn_in", Integer, nullable=False),
-    Column("tau", Float, nullable=False),
-    Column("effective_samples", Float, nullable=False),
-    Column("acceptance", Float, nullable=False),
-    Column("evaluations", BigInteger, nullable=False),
+    Column("ln_evidence", Float),
+    Column("chi2", Float),
+    Column("degrees_of_freedom", Integer),
+    Column("condition_number", Float),
+    Column("chain_status", String(16)),
+    Column("walkers", Integer),
+    Column("steps", Integer),
+    Column("burn_in", Integer),
+    Column("tau", Float),
+    Column("effective_samples", Float),
+    Column("acceptance", Float),
+    Column("evaluations", BigInteger),
+    # Up to here.
     Column("arc_magnitude", Float, nullable=False),
     Column("agn_contrast", Float),
     Column("surface_brightness", Float, nullable=False),
@@ -253,47 +279,61 @@ result = Table(
     Column("figure_digest", String(64)),
     Column("products", String(200)),
     Column("products_digest", String(64)),
+    Index("ix_result_input_id_run_id", "input_id", "run_id"),
+    Index("ix_result_observation_digest", "observation_digest"),
 )
 
-GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
-"""Runs that agree in these are runs of one input."""
+
+def _quantity_columns() -> list[Column[Any]]:
+    # All null where results are older than a quantity; the bias also where there is no truth.
+    return [Column(f"{quantity}_{part}", Float) for quantity in QUANTITIES for part in ("mean", "sd", "bias")]
+
+
+SUMMED = ("magnitude", "r_eff", "n")
+"""What a summary of a grid shows; the other quantities stand with each result."""
+
+# One answer of one estimator under one prior of n; where it has none there is no row.
+estimate = Table(
+    "estimate",
+    metadata,
+    Column("run_id", ForeignKey("result.run_id"), primary_key=True),
+    Column("estimator", String(16), primary_key=True),
+    Column("index_prior", String(16), primary_key=True),
+    Column("input_id", ForeignKey("input.id"), nullable=False),
+    *_quantity_columns(),
+    *(Column(part, Integer) for part in COUNTS),
+    # Answers over many runs of one estimator are read from here alone, without the table.
+    Index(
+        "ix_estimate_answer",
+        "estimator",
+        "index_prior",
+        "input_id",
+        *(f"{quantity}_{part}" for quantity in SUMMED for part in ("bias", "sd")),
+    ),
+)
+
 COUNTED = ("runs", "at_bound", "failed")
 """Runs with an answer of the estimator, and draws of those runs."""
-SUMMED = ("magnitude", "r_eff", "n")
-"""What a summary shows; the other quantities stand with each result."""
 
 
-def _sum_columns(parts: tuple[str, ...]) -> list[Column[Any]]:
-    columns: list[Column[Any]] = [Column("runs", Integer, nullable=False)]
-    for estimate in ESTIMATES:
-        columns += [Column(f"{estimate}_{name}", BigInteger, nullable=False) for name in COUNTED]
-        for quantity in SUMMED:
-            columns += [
-                Column(f"{estimate}_{quantity}_{part}", Integer if part == "bias_runs" else Float, nullable=False)
-                for part in parts
-            ]
-    return columns
+def _moments(owner: str, parts: tuple[str, ...]) -> tuple[Column[Any], ...]:
+    """Sums over one estimator's answers, for each row of the table ``owner``."""
+    return (
+        Column(f"{owner}_id", ForeignKey(f"{owner}.id"), primary_key=True, autoincrement=False),
+        Column("estimator", String(16), primary_key=True),
+        Column("index_prior", String(16), primary_key=True),
+        *(Column(name, BigInteger, nullable=False) for name in COUNTED),
+        *(
+            Column(f"{quantity}_{part}", Integer if part == "bias_runs" else Float, nullable=False)
+            for quantity in SUMMED
+            for part in parts
+        ),
+    )
 
 
-# Sums over the results of one input and of a whole grid, written by service.store.sums alone.
-input_sum = Table(
-    "input_sum",
-    metadata,
-    Column("grid_id", ForeignKey("grid.id"), primary_key=True),
-    *(
-        Column(column.name, column.type, primary_key=True, autoincrement=False)
-        for column in _input_columns()
-        if column.name in GROUP_COLUMNS
-    ),
-    *_sum_columns(("sd", "bias", "bias_runs", "shift", "shift2")),
-)
-
-grid_sum = Table(
-    "grid_sum",
-    metadata,
-    Column("grid_id", ForeignKey("grid.id"), primary_key=True),
-    *_sum_columns(("sd", "bias", "bias2", "bias_runs")),
-)
+# Sums over the answers of one input and of a whole grid, written by service.store.sums alone.
+input_moments = Table("input_moments", metadata, *_moments("input", ("sd", "bias", "bias_runs", "shift", "shift2")))
+grid_moments = Table("grid_moments", metadata, *_moments("grid", ("sd", "bias", "bias2", "bias_runs")))
 
 attempt = Table(
     "attempt",

@@ -84,7 +84,7 @@ class Topology:
         kind, program, *arguments = self.services[name]["healthcheck"]["test"]
         assert (kind, program) == ("CMD", "python")
         check = [sys.executable, *(self.here(part, instance) for part in arguments)]
-        return subprocess.run(check, capture_output=True, check=False, timeout=20).returncode == 0
+        return subprocess.run(check, capture_output=True, check=False, timeout=120).returncode == 0
 
     def instances(self) -> dict[str, str]:
         """Name of the service of each container that stays, those that are waited for first."""
@@ -104,7 +104,7 @@ class Topology:
     def running(self) -> Iterator[None]:
         """Migrations, then all services, started again when they end, as ``restart: unless-stopped`` says."""
         migrate = self.start("migrate", "migrate")
-        assert migrate.wait(timeout=60) == 0, (self.folder / "migrate.log").read_text()
+        assert migrate.wait(timeout=120) == 0, (self.folder / "migrate.log").read_text()
         instances = self.instances()
         assert {self.services[name]["restart"] for name in instances.values()} == {"unless-stopped"}
         self._running = {instance: self.start(name, instance) for instance, name in instances.items()}
@@ -123,7 +123,7 @@ class Topology:
                 process.terminate()
             for process in self._running.values():
                 with suppress(subprocess.TimeoutExpired):
-                    process.wait(timeout=20)
+                    process.wait(timeout=120)
                 with suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
                 process.wait()

@@ -328,15 +328,15 @@ def test_the_slurm_job_waits_for_the_dispatcher_before_it_stops_the_scheduler(ca
         return log.read_text().splitlines() if log.exists() else []
 
     try:
-        eventually(lambda: len(said()) == 2 and (tmp_path / "scheduler").exists(), 30, "a start of both")
+        eventually(lambda: len(said()) == 2 and (tmp_path / "scheduler").exists(), what="a start of both")
         if cause.startswith("told"):
             job.send_signal(signal.SIGTERM)
         else:
             Path(f"{log}.{cause}").touch()
         if cause == "told twice":
-            eventually(lambda: "dispatcher told" in said(), 30, "the dispatcher is told")
+            eventually(lambda: "dispatcher told" in said(), what="the dispatcher is told")
             job.send_signal(signal.SIGTERM)
-        code = job.wait(timeout=30)
+        code = job.wait(timeout=120)
     finally:
         job.kill()
     both = ["dispatcher told", "dispatcher ended", "scheduler told", "scheduler ended"]
@@ -383,14 +383,14 @@ def test_the_slurm_jobs_run_a_grid_where_srun_starts_one_task_here(tmp_path: Pat
     jobs = [start("hostlens-dispatcher", 1)]
     database = Database(url)
     try:
-        eventually((tmp_path / "shared" / "scheduler").exists, 60, "the scheduler's address")
+        eventually((tmp_path / "shared" / "scheduler").exists, what="the scheduler's address")
         jobs.append(start("hostlens-workers", 2))
         grids = GridStore(database)
         grid_id = submit(grids, 4)
-        eventually(lambda: grids.grid(grid_id).finished_at, 60, "the end of the grid")
+        eventually(lambda: grids.grid(grid_id).finished_at, what="the end of the grid")
         assert grids.grid(grid_id).counts.done == 4
         jobs[0].send_signal(signal.SIGTERM)
-        assert jobs[0].wait(timeout=60) == 0
+        assert jobs[0].wait(timeout=120) == 0
     except BaseException:
         print(*(log.read_text()[-3000:] for log in tmp_path.glob("*.log")), sep="\n")
         raise
@@ -399,4 +399,4 @@ def test_the_slurm_jobs_run_a_grid_where_srun_starts_one_task_here(tmp_path: Pat
         for job in jobs:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(job.pid, signal.SIGKILL)
-            job.wait(timeout=20)
+            job.wait(timeout=120)

@@ -9,13 +9,12 @@ import httpx
 import pytest
 
 from service.client import ApiError, Client
-from service.store.database import Database
 from service.store.migrate import differences
 from tests.deploy.compose import Topology
+from tests.drills.stored import read_records
 from tests.service.conftest import new_database
 from tests.service.plans import body
 from tests.service.service_process import eventually
-from tests.service.test_processes import stored_once
 
 RUNS = 24
 
@@ -35,7 +34,7 @@ def test_a_grid_completes_in_the_compose_file_s_topology_through_kills_of_a_work
             except (httpx.TransportError, ApiError):
                 return 0  # the API is still starting
 
-        eventually(lambda: workers() == 2, 90, "two workers")
+        eventually(lambda: workers() == 2, what="two workers")
         for instance, name in topology.instances().items():
             if "healthcheck" in topology.services[name]:
                 assert topology.healthy(name, instance), instance
@@ -45,15 +44,14 @@ def test_a_grid_completes_in_the_compose_file_s_topology_through_kills_of_a_work
         def done() -> int:
             return client.status(grid.id).counts.done
 
-        eventually(lambda: done() >= 4, 60, "the first results")
+        eventually(lambda: done() >= 4, what="the first results")
         topology.kill("worker-0")
-        eventually(lambda: done() >= 10, 60, "results after the kill of a worker")
+        eventually(lambda: done() >= 10, what="results after the kill of a worker")
         topology.kill("dispatcher-0")
-        ended = client.wait(grid.id, timeout_s=90)
+        ended = client.wait(grid.id, timeout_s=300)
         assert ended.counts.done == RUNS
         assert topology.restarts == 2
-        eventually(lambda: workers() == 2, 60, "the killed worker's successor")
+        eventually(lambda: workers() == 2, what="the killed worker's successor")
         assert client.readiness().status == "ready"
-    database = Database(url)
-    assert stored_once(database, grid.id) == RUNS
-    database.close()
+    found = read_records(url, grid.id)
+    assert (found.states, found.stored) == ({"done": RUNS}, RUNS)

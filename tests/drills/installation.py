@@ -24,6 +24,8 @@ from service.runtime.process import PARENT_FD
 T = TypeVar("T")
 ROOT = Path(service.__file__).resolve().parents[1]
 _MARK = "HOSTLENS_DRILL_MARK"
+PATIENCE_S = 120.0
+"""How long anything is waited for that takes a moment, or ten seconds, on a machine that has nothing else to do."""
 
 
 class DrillError(RuntimeError):
@@ -37,7 +39,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def eventually(look: Callable[[], T], timeout_s: float = 30.0, what: str = "it") -> T:
+def eventually(look: Callable[[], T], timeout_s: float = PATIENCE_S, what: str = "it") -> T:
     """Wait until ``look`` gives something that is true; a DrillError names what did not happen."""
     until = time.monotonic() + timeout_s
     while time.monotonic() < until:
@@ -125,7 +127,7 @@ class Installation:
                 stderr=log,
             )
 
-    def wait_ready(self, workers: int = 1, timeout_s: float = 90.0) -> Readiness:
+    def wait_ready(self, workers: int = 1, timeout_s: float = 2 * PATIENCE_S) -> Readiness:
         """Wait until it computes with at least so many worker threads."""
 
         def look() -> Readiness | None:
@@ -201,7 +203,7 @@ class Installation:
     def end(self, number: int = signal.SIGINT) -> int:
         """Stop the service as a user would; its exit code."""
         self.process.send_signal(number)
-        return self.process.wait(timeout=40)
+        return self.process.wait(timeout=PATIENCE_S)
 
     def kill_all(self) -> None:
         """End every process that is left, at once."""
@@ -209,9 +211,9 @@ class Installation:
         for process in left:
             with suppress(psutil.Error):
                 process.kill()
-        psutil.wait_procs(left, timeout=10)
+        psutil.wait_procs(left, timeout=PATIENCE_S)
         for started in self.started:
-            started.wait(timeout=20)
+            started.wait(timeout=120)
         self.client.__exit__()
         for end in self._pipe:
             os.close(end)
@@ -236,7 +238,7 @@ def installation(
         if ready:
             own.wait_ready()
         else:
-            eventually(own.readiness, 60, "an answer")
+            eventually(own.readiness, what="an answer")
         yield own
     finally:
         own.kill_all()

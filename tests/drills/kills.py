@@ -8,8 +8,11 @@ import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Event, Thread
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import psutil
 
@@ -19,13 +22,25 @@ from tests.drills.installation import Installation, eventually, free_port, insta
 from tests.drills.report import Claim, Figure, Report, quantile
 from tests.drills.stored import Records, records
 
+Table = list[tuple[Any, ...]]
+_SMALL = 40
 
-def undisturbed(ground: Ground, runs: int, sleep_s: float = 0.0) -> Records:
-    """What a grid looks like that nothing happened to, from a service of its own on SQLite."""
-    with installation(ground.folder / "undisturbed", {"HOSTLENS_DRILL_SLEEP": str(sleep_s)}) as calm:
+
+def undisturbed(runs: int) -> Table:
+    """The results of a grid that nothing happened to, from a service of its own on SQLite.
+
+    Small drills in one process share one: the first runs of a grid are the same in a longer one.
+    """
+    return _undisturbed(max(runs, _SMALL))[:runs]
+
+
+@cache
+def _undisturbed(runs: int) -> Table:
+    folder = TemporaryDirectory(prefix="hostlens-undisturbed-", ignore_cleanup_errors=True)
+    with folder, installation(Path(folder.name), {"HOSTLENS_DRILL_SLEEP": "0"}) as calm:
         grid = calm.client.submit(body(runs))
         calm.watch(grid.id)
-        return records(calm, grid.id)
+        return records(calm, grid.id).results
 
 
 def stored_once(found: Records, runs: int) -> Claim:
@@ -33,9 +48,9 @@ def stored_once(found: Records, runs: int) -> Claim:
     return Claim(f"{runs} runs done, each stored once", found.states == {"done": runs} and found.stored == runs)
 
 
-def identical(found: Records, calm: Records) -> Claim:
+def identical(found: Records, calm: Table) -> Claim:
     """That a disturbed grid's table is an undisturbed one's."""
-    return Claim("table identical to an undisturbed grid's", found.results == calm.results)
+    return Claim("table identical to an undisturbed grid's", found.results == calm)
 
 
 def progress(service: Installation, grid_id: str, least: int) -> int:
@@ -45,7 +60,7 @@ def progress(service: Installation, grid_id: str, least: int) -> int:
         done = service.client.status(grid_id).counts.done
         return done if done >= least else 0
 
-    return eventually(look, 120, f"the result number {least}")
+    return eventually(look, what=f"the result number {least}")
 
 
 @dataclass(frozen=True)
@@ -63,7 +78,7 @@ class DispatcherKills(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Kill whenever another share of the grid is done, so that every kill finds runs in flight."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         gaps = []
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), **ground.settings}
         with installation(ground.folder / "drill", settings) as service:
@@ -111,7 +126,7 @@ class DispatcherKills(Drill):
 
     @staticmethod
     def _kill(service: Installation) -> float:
-        found = eventually(lambda: service.child("service.dispatcher"), 60, "a dispatcher")
+        found = eventually(lambda: service.child("service.dispatcher"), what="a dispatcher")
         if found is not None:
             found.kill()
         return time.monotonic()
@@ -137,7 +152,7 @@ class WorkerKills(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Kill one worker after the other, oldest first, until the grid has ended."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         kills, stop = [], Event()
         settings = {
             "HOSTLENS_DRILL_SLEEP": str(self.sleep_s),
@@ -205,7 +220,7 @@ class SchedulerKills(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Kill the scheduler whenever another share of the grid is done; it and its workers are started again."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         gaps = []
         folder = ground.folder / "drill"
         port = free_port()

@@ -50,7 +50,7 @@ class PostgresKills(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Use a throw-away server, whatever database was named: somebody else's is not to be killed."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         kills, stop = 0, Event()
         with postgres_server() as server:
             settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_DATABASE_URL": server.create("drill")}
@@ -61,10 +61,14 @@ class PostgresKills(Drill):
 
                 def kill() -> None:
                     nonlocal kills
+                    done = 0
                     while not stop.wait(self.every_s):
-                        server.kill()
-                        server.start()
-                        kills += 1
+                        # A busy machine may need longer to get anything done between two kills.
+                        if (now := _stored(service, grid.id)) > done:
+                            done = now
+                            server.kill()
+                            server.start()
+                            kills += 1
 
                 killer = Thread(target=kill, name="killer")
                 killer.start()
@@ -109,7 +113,7 @@ class SqliteLock(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Lock in the middle of a grid; read all the time, submit once."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         reads: list[float] = []
         with installation(ground.folder / "drill", {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s)}) as service:
             service.wait_ready(2)
@@ -136,7 +140,7 @@ class SqliteLock(Drill):
                     reads.append(time.monotonic() - began)
                     time.sleep(0.05)
             finally:
-                locker.wait(timeout=60)
+                locker.wait(timeout=120)
                 if locker.stdout is not None:
                     locker.stdout.close()
             other.join(60)
@@ -156,7 +160,7 @@ class SqliteLock(Drill):
             (
                 stored_once(found, self.runs),
                 identical(found, calm),
-                Claim("reads go on", max(reads) < 1.0),
+                Claim("no read waits for the lock", max(reads) < self.lock_s / 2),
                 Claim("the submission is accepted once the lock is gone", bool(second)),
                 Claim("the leader stays", generation == 1),
             ),
@@ -183,7 +187,7 @@ class DiskFull(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Take the room away in the middle of a grid."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         with installation(ground.folder / "drill", {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s)}) as service:
             service.wait_ready(2)
             grid = service.client.submit(body(self.runs))
@@ -195,7 +199,7 @@ class DiskFull(Drill):
                 time.sleep(max(until - time.monotonic(), 0.0))
                 stuck = service.client.status(grid.id).counts.done
             freed = time.monotonic()
-            eventually(lambda: _answers(lambda: service.client.submit(body(1, seed=10_000))), 30, "an accepted grid")
+            eventually(lambda: _answers(lambda: service.client.submit(body(1, seed=10_000))), what="an accepted grid")
             accepted = time.monotonic() - freed
             progress(service, grid.id, min(stuck + 1, self.runs))
             resumed = time.monotonic() - freed
@@ -206,7 +210,7 @@ class DiskFull(Drill):
             read_only = f"sqlite:///file:{file}?mode=ro&uri=true"
             service.start("service.api", HOSTLENS_PORT=str(port), HOSTLENS_DATABASE_URL=read_only)
             with Client(f"http://127.0.0.1:{port}") as client:
-                eventually(lambda: _answers(lambda: client.status(grid.id)), 30, "an answer from the read-only API")
+                eventually(lambda: _answers(lambda: client.status(grid.id)), what="an answer from the read-only API")
                 refused_too = _refusal(client)
             intact = _integrity(service)
         return Report(
@@ -254,6 +258,14 @@ def _refusal(client: Client) -> str:
         complete = {"type", "title", "status"} <= set(error.problem)
         return f"{error.status} {'problem+json' if complete else 'without a problem'}"
     return "accepted"
+
+
+def _stored(service: Installation, grid_id: str) -> int:
+    """Results so far; none where nobody can be asked."""
+    try:
+        return service.client.status(grid_id).counts.done
+    except (ApiError, httpx.TransportError):
+        return 0
 
 
 def _answers(ask: Callable[[], Any]) -> bool:

@@ -24,7 +24,7 @@ DURABLE = ("listen_addresses=", "max_connections=60")
 FAST = (*DURABLE, "fsync=off", "synchronous_commit=off", "full_page_writes=off")
 """Settings for tests: what is committed may be lost when the server dies."""
 _DEBIAN = Path("/usr/lib/postgresql")
-_START_S = 60.0
+_START_S = 120.0
 _STOP_S = 20.0
 
 

@@ -37,7 +37,7 @@ class StoppedWorker(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Stop a worker that is at a run; wake it when the grid has ended, if it is still there."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_DEADLINE_S": str(self.deadline_s)}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
             service.wait_ready(2)
@@ -89,7 +89,7 @@ class TwoDispatchers(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Start both without a supervisor, so that nobody brings the dead one back."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         folder = ground.folder / "drill"
         (folder / "data").mkdir(parents=True)
         upgrade(ground.database_url or f"sqlite:///{folder / 'data' / 'hostlens.sqlite'}")
@@ -102,7 +102,7 @@ class TwoDispatchers(Drill):
             before = Counter(service.executed())
             psutil.Process(int(first.holder.split("|")[1])).send_signal(signal.SIGKILL)
             killed = time.monotonic()
-            eventually(lambda: _leader(service).generation > first.generation, 60, "a new leader")
+            eventually(lambda: _leader(service).generation > first.generation, what="a new leader")
             leads = time.monotonic() - killed
             done = service.client.status(grid.id).counts.done
             progress(service, grid.id, done + 1)
@@ -131,7 +131,7 @@ class TwoDispatchers(Drill):
 
 def _leader(service: Installation) -> LeaderView:
     with closing(Database(service.database, pooled=False)) as database:
-        return eventually(Leadership(database).view, 30, "a leader") or _never()
+        return eventually(Leadership(database).view, what="a leader") or _never()
 
 
 def _never() -> LeaderView:

@@ -7,13 +7,13 @@ from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import Connection, func, select
 
 from service.store.database import Database
-from service.store.tables import attempt, event, result, run
+from service.store.tables import attempt, estimate, event, result, run
 from tests.drills.installation import Installation
 
-_OF_THIS_GRID = frozenset({"run_id", "grid_id", "stored_at"})
+_OF_THIS_GRID = frozenset({"run_id", "grid_id", "input_id", "stored_at"})
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,7 @@ def read_records(database_url: str, grid_id: str) -> Records:
         states = {row.state: row.runs for row in connection.execute(counted.group_by(run.c.state))}
         mine = select(*columns).join(run, run.c.id == result.c.run_id).where(run.c.grid_id == grid_id)
         results = [tuple(row) for row in connection.execute(mine.order_by(run.c.ordinal))]
+        answers = _answers(connection, grid_id)
         ended = select(run.c.ordinal, attempt.c.outcome).join(run, run.c.id == attempt.c.run_id)
         charged: dict[int, Counter[str]] = {}
         for row in connection.execute(ended.where(run.c.grid_id == grid_id)):
@@ -53,7 +54,20 @@ def read_records(database_url: str, grid_id: str) -> Records:
         late = connection.scalar(stale) or 0
     outcomes: Counter[str] = sum(charged.values(), Counter())
     repeated = {ordinal: ends for ordinal, ends in charged.items() if ends.total() > 1}
-    return Records(states, [_comparable(row) for row in results], dict(outcomes), repeated, late)
+    stored = [(*_comparable(row), *found) for row, found in zip(results, answers, strict=True)]
+    return Records(states, stored, dict(outcomes), repeated, late)
+
+
+def _answers(connection: Connection, grid_id: str) -> list[tuple[Any, ...]]:
+    """Every estimate of each result, in the grid's order."""
+    columns = [column for column in estimate.c if column.name not in _OF_THIS_GRID]
+    mine = select(run.c.ordinal, *columns).select_from(run.join(result).outerjoin(estimate))
+    found: dict[int, tuple[Any, ...]] = {}
+    for ordinal, *values in connection.execute(
+        mine.where(run.c.grid_id == grid_id).order_by(run.c.ordinal, estimate.c.estimator, estimate.c.index_prior)
+    ):
+        found[ordinal] = (*found.get(ordinal, ()), *map(repr, values))
+    return list(found.values())
 
 
 def records(installation: Installation, grid_id: str) -> Records:

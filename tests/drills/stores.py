@@ -44,9 +44,9 @@ class StoreAway(Drill):
             progress(service, grid.id, self.runs // 4)
             with _away(store):
                 gone = time.monotonic()
-                eventually(lambda: _is_told(service), 60, "a readiness that tells of the store")
+                eventually(lambda: _is_told(service), what="a readiness that tells of the store")
                 told = time.monotonic() - gone
-                eventually(lambda: service.client.status(grid.id).counts.leased == _held(service, grid.id), 60, "rest")
+                eventually(lambda: service.client.status(grid.id).counts.leased == _held(service, grid.id), what="rest")
                 before = service.client.status(grid.id).counts
                 time.sleep(max(self.away_s - (time.monotonic() - gone), 0.0))
                 after = service.client.status(grid.id).counts
@@ -104,6 +104,6 @@ def _held(service: Installation, grid_id: str) -> int:
 
 
 def _figures_shown(service: Installation, grid_id: str) -> int:
-    with httpx.Client(base_url=f"http://127.0.0.1:{service.port}") as asking:
+    with httpx.Client(base_url=f"http://127.0.0.1:{service.port}", timeout=60.0) as asking:
         runs = asking.get(f"/v1/grids/{grid_id}/runs?limit=1000").json()["items"]
         return sum(asking.get(f"/v1/runs/{run['id']}/figure").status_code == 200 for run in runs)

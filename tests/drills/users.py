@@ -33,7 +33,7 @@ class Cancel(Drill):
         with installation(ground.folder / "drill", settings) as service:
             service.wait_ready(2)
             grid = service.client.submit(body(self.runs))
-            eventually(lambda: service.client.status(grid.id).counts.leased == 2, 30, "two runs in flight")
+            eventually(lambda: service.client.status(grid.id).counts.leased == 2, what="two runs in flight")
             began = time.monotonic()
             answer = service.client.cancel(grid.id)
             queued = time.monotonic() - began

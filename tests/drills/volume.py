@@ -21,7 +21,7 @@ from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import upgrade
 from service.store.queue import RunQueue
-from service.store.tables import grid, grid_sum, input_sum, result, run
+from service.store.tables import estimate, grid, grid_moments, input_group, input_moments, result, run
 from tests.drills.drill import Drill, Ground, body
 from tests.drills.installation import DrillError, installation
 from tests.drills.report import Claim, Figure, Report, quantile
@@ -203,17 +203,28 @@ def _work(database: Database, generation: int, runs: int) -> None:
 def _copy(connection: Connection, original: str) -> None:
     """A second grid like the first, with its runs, results and sums, under an id of its own."""
     copied = new_grid_id(utc_now())
-    renamed = {"id": ("r_" + original[2:], "r_" + copied[2:]), "run_id": ("r_" + original[2:], "r_" + copied[2:])}
+    mine = select(input_group.c.id).where(input_group.c.grid_id == original)
     _copy_rows(connection, grid, grid.c.id == original, {"id": literal(copied)})
-    for table in (run, result, input_sum, grid_sum):
+    for table in (run, input_group, result, estimate, input_moments, grid_moments):
+        which = table.c.grid_id == original if "grid_id" in table.c else table.c.input_id.in_(mine)
         changes: dict[str, Any] = {"grid_id": literal(copied)}
-        for name, (old, new) in renamed.items():
-            if name in table.c:
-                changes[name] = func.replace(table.c[name], old, new)
-        _copy_rows(connection, table, table.c.grid_id == original, changes)
+        if table is run or "run_id" in table.c:
+            name = "id" if table is run else "run_id"
+            changes[name] = func.replace(table.c[name], "r_" + original[2:], "r_" + copied[2:])
+        if "input_id" in table.c:
+            changes["input_id"] = _copied_input(table, copied)
+        _copy_rows(connection, table, which, changes)
+
+
+def _copied_input(table: Table, copied: str) -> Any:
+    """Of a row that refers to an input, the id of its copy, which has the same digest in the other grid."""
+    old, new = input_group.alias(), input_group.alias()
+    same = select(new.c.id).join(old, old.c.digest == new.c.digest)
+    return same.where(new.c.grid_id == copied, old.c.id == table.c.input_id).correlate(table).scalar_subquery()
 
 
 def _copy_rows(connection: Connection, table: Table, which: Any, changes: dict[str, Any]) -> None:
-    names = [column.name for column in table.columns]
+    # An input is numbered by the database.
+    names = [column.name for column in table.columns if column.autoincrement is not True]
     wanted = select(*(changes.get(name, table.c[name]) for name in names)).where(which)
     connection.execute(insert(table).from_select(names, wanted))

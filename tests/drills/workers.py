@@ -31,7 +31,7 @@ class SilentWorker(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Stop a worker that is at a run, and leave it so."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_WORKER_TTL_S": str(self.ttl_s)}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
             service.wait_ready(2)
@@ -86,7 +86,7 @@ class Lifetime(Drill):
 
     def run(self, ground: Ground) -> Report:
         """Let a grid go through several generations of workers."""
-        calm = undisturbed(ground, self.runs)
+        calm = undisturbed(self.runs)
         pids: set[int] = set()
         settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_WORKER_LIFETIME_S": str(self.lifetime_s)}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:

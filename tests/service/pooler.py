@@ -19,7 +19,7 @@ import pytest
 
 from tests.drills.installation import free_port
 
-_START_S = 30.0
+_START_S = 120.0
 
 
 def program() -> Path:

@@ -16,8 +16,8 @@ Serving = Installation
 
 @contextmanager
 def serving(folder: Path, **settings: str) -> Iterator[Installation]:
-    """A service that is gone afterwards, whatever happened."""
-    service = Installation(folder, settings)
+    """A service that is gone afterwards, whatever happened; one API process, for each takes seconds to start."""
+    service = Installation(folder, {"HOSTLENS_API_PROCESSES": "1", **settings})
     try:
         service.wait_ready()
         yield service

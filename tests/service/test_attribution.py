@@ -13,7 +13,7 @@ def stalls_of(
     condition: Callable[[int], Condition], given: float | None = None, looks: int = 30, step: float = 2.0
 ) -> list[tuple[float, Stall]]:
     """Look at one worker again and again; what was found, and when."""
-    stalls, found = Stalls(silent_s=60.0), []
+    stalls, found = Stalls(silent_s=60.0, patience_s=20.0), []
     for look in range(looks):
         now = 1000.0 + look * step
         busy = {} if given is None else {"a": given}

@@ -21,7 +21,8 @@ from typer.testing import CliRunner, Result
 from service.api.app import create_app
 from service.cli.app import app
 from service.runtime.settings import Settings
-from tests.service.service_process import ROOT, free_port, serving
+from tests.drills.installation import Installation
+from tests.service.service_process import ROOT, eventually, free_port
 
 NOBODY = "http://127.0.0.1:1"
 GRID = "g_06h05zns0sxqesvz1qxk4a1s56"
@@ -358,15 +359,15 @@ def test_closed_and_broken_streams_and_an_ascii_locale_are_no_reason_to_fail(tmp
 
 
 def test_a_service_whose_output_nobody_reads_or_that_has_none_goes_on(tmp_path: Path) -> None:
-    """A pipe holds 64 KiB, and each of these requests is a line of the log."""
-    for redirection in ("unread", "closed"):
+    """A pipe holds 64 KiB, and each request is a line of the log, of a hundred bytes."""
+    for redirection, requests in (("unread", 900), ("closed", 10)):
         with serving_into(tmp_path / redirection, redirection) as service:
-            for _ in range(1200):
+            for _ in range(requests):
                 service.client.grids(limit=1)
             grid = service.client.submit({"preset": "h0licow-vi/HE0435", "n": [2]})
-            assert service.client.wait(grid.id, timeout_s=120).counts.done == grid.n_runs
+            assert service.client.wait(grid.id, timeout_s=300).counts.done == grid.n_runs
             assert service.end() == 0
-            assert service.processes() == []
+            eventually(lambda: service.processes() == [], what="the end of all processes")
     file = tmp_path / "closed" / "data" / "hostlens.sqlite"
     assert file.read_bytes().startswith(b"SQLite format 3")
 
@@ -375,19 +376,20 @@ def test_a_service_whose_output_nobody_reads_or_that_has_none_goes_on(tmp_path: 
 def serving_into(folder: Path, redirection: str) -> Iterator[Any]:
     """A service whose standard streams are a pipe that nobody reads, or closed."""
     folder.mkdir()
-    with serving(folder, HOSTLENS_DRILL_SLEEP="0") as service:
-        assert service.end() == 0
-        command, read_end = [sys.executable, "-m", "service", "serve"], -1
-        options: dict[str, Any] = {}
-        if redirection == "closed":
-            command = ["sh", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "sh", *command]
-        else:
-            read_end, write_end = os.pipe()
-            options = {"stdout": write_end, "stderr": write_end}
-        again = subprocess.Popen(command, cwd=folder, env=service.environment, **options)
-        service.started.insert(0, again)
+    service = Installation(folder, {"HOSTLENS_DRILL_SLEEP": "0", "HOSTLENS_API_PROCESSES": "1"}, commands=())
+    command, read_end = [sys.executable, "-m", "service", "serve"], -1
+    options: dict[str, Any] = {}
+    if redirection == "closed":
+        command = ["sh", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "sh", *command]
+    else:
+        read_end, write_end = os.pipe()
+        options = {"stdout": write_end, "stderr": write_end}
+    try:
+        service.started.append(subprocess.Popen(command, cwd=folder, env=service.environment, **options))
         service.wait_ready()
         yield service
+    finally:
+        service.kill_all()
         if read_end >= 0:
             os.close(read_end)
             os.close(options["stdout"])
@@ -404,4 +406,4 @@ def test_serve_says_so_when_it_serves_on_ipv6_too(tmp_path: Path) -> None:
         status = called("status", "--url", f"http://[::1]:{port}")
         assert (status.exit_code, status.output) == (0, "")
         run.terminate()
-        assert run.wait(60) == 0
+        assert run.wait(120) == 0

@@ -31,6 +31,7 @@ from service.store.leases import Lease
 from service.store.queue import RunQueue, Stored
 from service.worker.tasks import call_tasks
 from tests.service.plans import body, planned
+from tests.service.service_process import eventually
 
 
 class Answered:
@@ -536,14 +537,15 @@ def test_a_worker_with_another_engine_gets_no_run_and_its_answer_is_not_taken(
 
 def test_at_a_stop_runs_that_end_soon_are_waited_for(database: Database, tmp_path: Path) -> None:
     pool = InstantPool(tmp_path, "pending", "pending")
-    setting = Setting(database, pool, runs=2, drain_s=5.0)
+    setting = Setting(database, pool, runs=2, drain_s=120.0, stop_grace_s=150.0)
     setting.run(until=lambda: len(pool.submitted) == 2)
     threading.Timer(0.3, lambda: pool.futures[0].finish(tmp_path)).start()
     threading.Timer(0.6, lambda: pool.futures[1].finish(tmp_path)).start()
     began = time.monotonic()
     setting.dispatcher.drain()
     setting.dispatcher.hand_back()
-    assert time.monotonic() - began < 3.0
+    # Not for longer than they take: half of what it may wait leaves a busy machine its time.
+    assert time.monotonic() - began < 60.0
     assert setting.grids.grid(setting.grid_id).counts.done == 2
 
 
@@ -588,12 +590,9 @@ def test_a_heartbeat_outlasts_the_database_and_ends_once_another_leads(database:
     file.rmdir()
     hidden.rename(file)
     heartbeat.engines = {"e": 2}
-    until = time.monotonic() + 10
-    while (view := leadership.view()) is None or view.workers != 2:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    eventually(lambda: (view := leadership.view()) is not None and view.workers == 2, what="a beat")
     assert leadership.take("next", lambda _: True) == 2
-    assert heartbeat.lost.wait(10)
+    assert heartbeat.lost.wait(120)
     heartbeat.stop()
 
 

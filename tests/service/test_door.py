@@ -79,7 +79,7 @@ def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         )
     try:
         found = Server(port, log)
-        eventually(lambda: answers(found), 120, "an answer of the server")
+        eventually(lambda: answers(found), what="an answer of the server")
         yield found
         assert "Traceback" not in log.read_text()
     finally:
@@ -96,7 +96,7 @@ def answers(server: Server) -> bool:
 
 def ask(server: Server, request: bytes) -> Answer:
     """Send bytes, take all that comes until the server closes."""
-    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=120) as connection:
         connection.sendall(request)
         received = b""
         while piece := connection.recv(65536):
@@ -322,7 +322,7 @@ def refused_at(answer: httpx.Response) -> list[str]:
 
 def test_nothing_of_an_own_system_may_hold_what_cannot_be_seen_or_stored(server: Server) -> None:
     tried = 0
-    with httpx.Client(base_url=server.url, trust_env=False, timeout=60) as client:
+    with httpx.Client(base_url=server.url, trust_env=False, timeout=120) as client:
 
         def refuse(document: Any, pointer: str) -> None:
             nonlocal tried
@@ -371,7 +371,7 @@ def test_head_is_get_without_the_body_and_options_tells_what_there_is(server: Se
 
 
 def test_the_head_of_a_stream_comes_alone(server: Server) -> None:
-    grid = httpx.post(server.url + "/v1/grids", json=BODY, trust_env=False).json()["links"]["self"]
+    grid = httpx.post(server.url + "/v1/grids", json=BODY, trust_env=False, timeout=120).json()["links"]["self"]
     events = ("Accept", "text/event-stream")
     answer = ask(server, http("HEAD", grid + "/events", events))
     assert (answer.status, answer.body) == (200, b"")
@@ -468,7 +468,7 @@ def test_what_is_not_http_is_told_so_and_nothing_else_happens(server: Server, na
 def test_a_bad_request_behind_good_ones_takes_no_answer_from_them(server: Server, bad: str) -> None:
     status, request = MALFORMED[bad]
     sent = 2 * raw(GET, HOST) + request + raw(GET, HOST)
-    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=120) as connection:
         connection.sendall(sent)
         received = b""
         while piece := connection.recv(65536):
@@ -482,7 +482,7 @@ def test_a_wish_for_another_protocol_changes_nothing(server: Server, protocol: b
     content = json.dumps(BODY).encode()
     first = raw(*POST, *wish, b"Content-Length: %d" % len(content), body=content)
     second = raw(*POST, *wish, CHUNKED, body=b"%x\r\n%s\r\n0\r\n\r\n" % (len(content), content))
-    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+    with socket.create_connection(("127.0.0.1", server.port), timeout=120) as connection:
         connection.sendall(first + second + raw(GET, HOST, *wish) + raw(GET, HOST, CLOSE))
         received = b""
         while piece := connection.recv(65536):

@@ -15,18 +15,17 @@ from service.store.database import Database
 from service.store.grids import GridStore
 from tests.drills import postgres
 from tests.drills.__main__ import DRILLS, app
-from tests.drills.drill import Ground, OccupiedError, ground
-from tests.drills.kills import SchedulerKills, WorkerKills
+from tests.drills.drill import THROW_AWAY, Drill, Ground, OccupiedError, ground
+from tests.drills.kills import DispatcherKills, WorkerKills
 from tests.drills.outages import DiskFull, PostgresKills, SqliteLock
-from tests.drills.remote import TwoWorkers
 from tests.drills.report import Report, quantile
 from tests.drills.rivals import Poison, StoppedWorker, TwoDispatchers
-from tests.drills.scale import Overhead, Throughput
 from tests.drills.stores import StoreAway
-from tests.drills.users import Cancel, Idempotency
 from tests.drills.volume import Listing, Submission
-from tests.drills.workers import Lifetime, SilentWorker
+from tests.drills.workers import Lifetime
 from tests.service.plans import submit
+
+OF_ONE_DATABASE = {"sqlite-lock", "disk-full", "postgres"}
 
 
 def unmet(report: Report) -> list[str]:
@@ -44,56 +43,60 @@ def _is_at(process: psutil.Process, folder: Path) -> bool:
         return False
 
 
+@pytest.fixture(autouse=True)
+def one_api_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each takes seconds to start."""
+    monkeypatch.setenv("HOSTLENS_API_PROCESSES", "1")
+
+
 @pytest.mark.parametrize(
     "drill",
     [
+        DispatcherKills(runs=24, kills=2),
         WorkerKills(runs=24, every_s=1.0, workers=2),
-        SchedulerKills(runs=10, kills=1),
         pytest.param(PostgresKills(runs=40, every_s=1.5), marks=pytest.mark.postgres),
-        SqliteLock(runs=8, lock_s=2.0),
+        # Long enough for a read on a busy machine to end before half of it has gone.
+        SqliteLock(runs=8, lock_s=6.0),
         DiskFull(runs=8, full_s=1.5),
         StoreAway(runs=12, away_s=2.0),
-        StoppedWorker(runs=6, deadline_s=3.0),
-        SilentWorker(runs=6),
+        StoppedWorker(runs=6),
         Lifetime(runs=40, lifetime_s=2.0),
         TwoDispatchers(runs=20),
         Poison(runs=24, batch=4),
-        Cancel(runs=1000),
-        Idempotency(clients=20, runs=20),
     ],
     ids=lambda drill: drill.name,
 )
-def test_what_the_drill_claims_holds_and_nobody_is_left(drill: object, tmp_path: Path) -> None:
-    report = drill.run(Ground(tmp_path))  # type: ignore[attr-defined]
+def test_what_the_drill_claims_holds_and_nobody_is_left(drill: Drill, tmp_path: Path) -> None:
+    """Those that are not here have their small version elsewhere among the tests, or only measure."""
+    report = drill.run(Ground(tmp_path))
     assert unmet(report) == []
     assert nobody_left(tmp_path)
 
 
-def test_drills_of_scale_measure_what_they_say(tmp_path: Path) -> None:
+@pytest.mark.long
+@pytest.mark.timeout(4 * 3600)
+@pytest.mark.parametrize(
+    ("name", "database"),
+    [
+        *((name, None) for name in DRILLS),
+        *(pytest.param(name, THROW_AWAY, marks=pytest.mark.postgres) for name in DRILLS if name not in OF_ONE_DATABASE),
+    ],
+)
+def test_what_the_drill_claims_holds_at_its_full_size(
+    name: str, database: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("HOSTLENS_API_PROCESSES")
+    with ground(database) as place:
+        report = DRILLS[name]().run(place)
+    print(report.to_json())
+    assert unmet(report) == []
+
+
+def test_drills_of_volume_measure_what_they_say(tmp_path: Path) -> None:
     """That the figures come out and nothing is lost; how fast it is depends on who else is at the machine."""
-    throughput = Throughput(runs=300).run(Ground(tmp_path / "throughput"))
-    assert "300 runs done, each stored once" not in unmet(throughput)
-    assert float(throughput.value("rate")) > 0
     assert "every run is queued" not in unmet(Submission(runs=500).run(Ground(tmp_path / "submission")))
     listing = Listing(large=480, copies=2, papers=1, requests=2).run(Ground(tmp_path / "listing"))
     assert listing.value("stored results") == 2 * 480 * 2 + 384 + 240 // 2
-    assert "6 runs done, each stored once" not in unmet(Overhead(runs=6, sleep_s=0.2).run(Ground(tmp_path / "over")))
-    assert nobody_left(tmp_path)
-
-
-def test_two_workers_apart_lose_nothing_and_are_measured_against_one(tmp_path: Path) -> None:
-    """How much the second one adds depends on who else is at the machine, so only that it was measured."""
-    report = TwoWorkers(runs=4, cpu_s=0.1).run(Ground(tmp_path))
-    assert set(unmet(report)) <= {"at least 1.9 times the throughput"}
-    alone, together, ratio = (float(report.value(name)) for name in ("one worker", "two workers", "ratio"))
-    # Four runs of 0.1 s of CPU cannot take less.
-    assert alone >= 0.4
-    assert together >= 0.2
-    assert ratio == alone / together
-    # Four runs of 0.1 s, by one and by two; the kernel counts the CPU of others in hundredths of a second.
-    for spent in str(report.value("CPU of workers: with one / with two")).split(" / "):
-        assert float(spent) >= 0.35
-    assert float(report.value("ratio without these waits")) > 0
     assert nobody_left(tmp_path)
 
 
@@ -103,7 +106,7 @@ def test_the_command_shows_writes_and_ends_as_the_claims_say(tmp_path: Path) -> 
     assert listed.exit_code == 0
     assert all(name in listed.output for name in DRILLS)
     file = tmp_path / "report.json"
-    done = run.invoke(app, ["idempotency", "clients=5", "runs=3", "--json", str(file)])
+    done = run.invoke(app, ["idempotency", "clients=20", "runs=20", "--json", str(file)])
     assert done.exit_code == 0, done.output
     document = json.loads(file.read_text())
     assert document["holds"]
@@ -114,9 +117,14 @@ def test_the_command_shows_writes_and_ends_as_the_claims_say(tmp_path: Path) -> 
 
 
 @pytest.mark.postgres
-def test_a_drill_on_postgresql_brings_its_own_server_and_leaves_none(tmp_path: Path) -> None:
-    before = len(list(Path(tempfile.gettempdir()).glob("hostlens-pg-*")))
+def test_a_drill_on_postgresql_brings_its_own_server_and_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "report.json"
+    # Whoever runs the server has to reach it, and the name of its socket has to be short.
+    room = Path(tempfile.mkdtemp(prefix="hostlens-room-"))
+    room.chmod(0o755)
+    monkeypatch.setattr(tempfile, "tempdir", str(room))
     wanted = ["throughput", "runs=300", "--database", "postgresql", "--json", str(file)]
     CliRunner().invoke(app, wanted)
     document = json.loads(file.read_text())
@@ -125,7 +133,7 @@ def test_a_drill_on_postgresql_brings_its_own_server_and_leaves_none(tmp_path: P
     # The server's work is counted: a run cannot be stored for nothing.
     spent = {figure["name"]: figure["value"] for figure in document["figures"]}
     assert spent["CPU a run, PostgreSQL"] > 0.05
-    assert len(list(Path(tempfile.gettempdir()).glob("hostlens-pg-*"))) == before
+    room.rmdir()  # which it would not be if anything were left there
 
 
 def test_a_drill_says_what_postgresql_lacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -125,8 +125,9 @@ def test_a_server_that_ends_a_statement_or_session_is_told_as_that_and_the_next_
         with database.write() as connection:
             connection.exec_driver_sql(statement)
             if kind is None:
-                Event().wait(0.3)
-                connection.exec_driver_sql("SELECT 2")
+                for _ in range(400):  # until the server has come to end the session
+                    Event().wait(0.3)
+                    connection.exec_driver_sql("SELECT 2")
 
     with pytest.raises(kind or DatabaseAwayError) as told:
         act()
@@ -219,7 +220,7 @@ def test_a_database_without_tables_says_what_to_do_wherever_it_is_met(
 
 @pytest.mark.postgres
 def test_a_statement_that_takes_too_long_is_504_and_says_so(migrated_postgres: str, tmp_path: Path) -> None:
-    slow = migrated_postgres + "&options=-c%20statement_timeout%3D100"
+    slow = migrated_postgres + "&options=-c%20statement_timeout%3D2000"
     holder = Database(migrated_postgres)
     with TestClient(create_app(Settings(database_url=slow, data_dir=tmp_path)), raise_server_exceptions=False) as api:
         made = api.post("/v1/grids", json=body(1)).json()["id"]
@@ -296,7 +297,7 @@ def test_a_password_that_is_changed_under_a_running_service_is_told_as_that_unti
         connection.exec_driver_sql("SELECT pg_reload_conf()")
     url = migrated_postgres.replace("hostlens@", f"locked_in:{OURS}@")
     with TestClient(create_app(Settings(database_url=url, data_dir=tmp_path)), raise_server_exceptions=False) as api:
-        eventually(lambda: api.get("/readyz").status_code == 200, 10, "the reloaded rules")
+        eventually(lambda: api.get("/readyz").status_code == 200, what="the reloaded rules")
         for password, status in (("another", 503), (OURS, 200)):
             with admin.write() as connection:
                 connection.exec_driver_sql(f"ALTER ROLE locked_in PASSWORD '{password}'")

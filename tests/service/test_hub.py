@@ -51,8 +51,8 @@ async def told(feed: Feed, events: int, after: int, pause_s: float = 0.0, limit:
     """What the data of so many events say, as one follower is told them."""
     seen: list[int] = []
     while len(seen) < events:
-        news = await feed.next(after, limit, 20.0)
-        assert news.told, "nothing came in 20 s"
+        news = await feed.next(after, limit, 120.0)
+        assert news.told, "nothing came in two minutes"
         after = news.told[-1].number
         seen += [one.view.detail["runs"] for one in news.told]
         await asyncio.sleep(pause_s)
@@ -157,7 +157,7 @@ def test_a_feed_that_cannot_be_read_lets_its_followers_go_and_the_next_begins_an
         after = events.latest(grid)
         with hub.follow(grid) as feed:
             events.error = ValueError("a mistake of ours")
-            assert await feed.next(after, 100, 20.0) == News((), ended=False)
+            assert await feed.next(after, 100, 120.0) == News((), ended=False)
             assert feed.closed
             events.error = None
             with hub.follow(grid) as other:
@@ -191,17 +191,17 @@ def test_the_end_of_a_grid_is_told_and_a_grid_that_goes_on_is_followed_again(dat
             await asyncio.to_thread(grids.cancel, grid)
             kinds: list[str] = []
             while True:
-                news = await feed.next(after, 1, 20.0)
+                news = await feed.next(after, 1, 120.0)
                 after = news.told[-1].number
                 kinds += [one.view.kind for one in news.told]
                 if news.ended:
                     break
             assert kinds == ["grid_cancelled", "grid_finished"]
-            assert await feed.next(after, 1, 20.0) == News([], ended=True)
+            assert await feed.next(after, 1, 120.0) == News([], ended=True)
             await until(lambda: feed.is_over)
             await asyncio.to_thread(grids.revive, grid)
             with hub.follow(grid) as other:
-                assert [one.view.kind for one in (await other.next(after, 9, 20.0)).told] == ["grid_revived"]
+                assert [one.view.kind for one in (await other.next(after, 9, 120.0)).told] == ["grid_revived"]
 
     asyncio.run(follow())
 
@@ -214,7 +214,7 @@ def test_a_hub_that_is_closed_lets_everybody_go_at_once(database: Database, grid
             waiting = asyncio.create_task(feed.next(after, 100, 30.0))
             await asyncio.sleep(0.1)
             hub.close()
-            assert await asyncio.wait_for(waiting, 5.0) == News((), ended=False)
+            assert await asyncio.wait_for(waiting, 25.0) == News((), ended=False)
         with hub.follow(grid) as late:
             assert late.closed
 
@@ -222,6 +222,6 @@ def test_a_hub_that_is_closed_lets_everybody_go_at_once(database: Database, grid
 
 
 async def until(look: Callable[[], bool]) -> None:
-    async with asyncio.timeout(20.0):
+    async with asyncio.timeout(120.0):
         while not look():
             await asyncio.sleep(0.01)

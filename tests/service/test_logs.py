@@ -6,16 +6,12 @@ import json
 import logging
 import sys
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
 from service.runtime import logs
 from service.runtime.settings import LogSettings
-from tests.service.plans import body
-from tests.service.service_process import serving
 
 
 @pytest.fixture
@@ -82,31 +78,3 @@ def test_a_level_may_be_written_small_and_an_unknown_one_is_refused() -> None:
     assert LogSettings.model_validate({"log_level": "warning"}).log_level == "WARNING"
     with pytest.raises(ValidationError, match="log_level"):
         LogSettings.model_validate({"log_level": "loud"})
-
-
-def test_every_process_tells_of_a_run_with_its_grid_attempt_and_generation(tmp_path: Path) -> None:
-    settings = {"HOSTLENS_LOG_FORMAT": "json", "HOSTLENS_TASK": "tests.service.tasks:moody"}
-    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0", HOSTLENS_RETRY_DELAY_S="0.1", **settings) as service:
-        grid = service.client.submit(body(4))
-        service.client.wait(grid.id, timeout_s=60)
-        runs = {run.ordinal: run.id for run in service.client.runs(grid.id)}
-        service.end()
-        lines = [line for text in service.log.read_text().splitlines() if (line := _parsed(text))]
-
-    def found(**wanted: Any) -> list[dict[str, Any]]:
-        return [line for line in lines if wanted.items() <= line.items()]
-
-    stored = found(process="dispatcher", event="stored", run=runs[0])
-    assert [(line["grid"], line["attempt"], line["generation"]) for line in stored] == [(grid.id, 1, 1)]
-    failed = found(process="worker", logger="service.worker.tasks", run=runs[1])
-    assert [line["attempt"] for line in failed] == [1, 2, 3]
-    assert all(line["grid"] == grid.id and "the dice fell" in line["exception"] for line in failed)
-    assert {line["code"] for line in found(process="dispatcher", run=runs[2], level="warning")} == {"invalid_result"}
-    assert found(process="api", event="accepted", grid=grid.id)
-    assert found(process="api", logger="uvicorn.access", grid=grid.id, method="GET", status=200)
-    assert {line["process"] for line in lines} == {"supervisor", "api", "dispatcher", "worker"}
-
-
-def _parsed(text: str) -> dict[str, Any] | None:
-    """A line of the log; None for what the supervisor says to whoever started it."""
-    return dict(json.loads(text)) if text.startswith("{") else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import socket
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +23,6 @@ from service.store.leases import Outcome
 from service.store.queue import Failure
 from tests.service.conftest import Clock
 from tests.service.plans import body, result_of, submit
-from tests.service.service_process import free_port, serving
 
 UNKNOWN_GRID = "g_" + "0" * 26
 
@@ -181,34 +179,6 @@ def test_what_becomes_of_runs_is_counted_after_it_was_committed(database: Databa
     assert (value("results_stale_total", digest="same"), value("results_stale_total", digest="other")) == (1, 0)
     assert value("queue_transaction_duration_seconds_count", what="store") == 2
     assert value("run_duration_seconds_count") == 1
-
-
-def test_a_grid_moves_the_counters_of_both_processes(tmp_path: Path) -> None:
-    port = free_port()
-    settings = {"HOSTLENS_METRICS_PORT": str(port), "HOSTLENS_TASK": "tests.service.tasks:moody"}
-    with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0", HOSTLENS_RETRY_DELAY_S="0.1", **settings) as service:
-        grid = service.client.submit(body(6))
-        service.client.wait(grid.id, timeout_s=60)
-
-        def read(where: int) -> Samples:
-            with urllib.request.urlopen(f"http://127.0.0.1:{where}/metrics", timeout=10) as answer:
-                return Samples(answer.read().decode())
-
-        dispatcher, api = read(port), read(service.port)
-        ended = {
-            state: dispatcher("hostlens_runs_ended_total", state=state) for state in ("done", "failed", "quarantined")
-        }
-        assert ended == {"done": 2, "failed": 3, "quarantined": 1}
-        assert dispatcher("hostlens_worker_deaths_total") == 3
-        assert dispatcher("hostlens_runs_requeued_total", reason="error") == 2
-        assert dispatcher("hostlens_runs_claimed_total") >= 10
-        assert dispatcher("hostlens_dispatcher_generation") == 1
-        assert dispatcher("hostlens_dispatcher_loop_duration_seconds_count") > 0
-        assert dispatcher("hostlens_runs_in_flight") == 0
-        assert dispatcher("process_resident_memory_bytes") > 0
-        assert api("hostlens_http_requests_total", method="POST", route="/v1/grids", status="202") == 1
-        assert api("hostlens_grids", state="failed") == 1
-        assert service.end() == 0
 
 
 def test_a_metrics_port_that_is_taken_is_said_and_not_passed_over() -> None:

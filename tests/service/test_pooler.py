@@ -108,7 +108,7 @@ def test_a_service_computes_a_grid_while_sessions_and_pooler_are_killed(postgres
                 return service.client.status(grid.id)
 
             def done(least: int) -> None:
-                eventually(lambda: _or_none(lambda: status().counts.done >= least), 60, "progress")
+                eventually(lambda: _or_none(lambda: status().counts.done >= least), what="progress")
 
             done(5)
             with psycopg.connect(direct.replace("+psycopg", ""), autocommit=True) as other:
@@ -118,7 +118,7 @@ def test_a_service_computes_a_grid_while_sessions_and_pooler_are_killed(postgres
                 )
             done(12)
             own.kill()
-            eventually(lambda: service.readiness() is None, 30, "an answer without a database")
+            eventually(lambda: service.readiness() is None, what="an answer without a database")
             own.start()
             done(30)
             assert status().state == "done"
@@ -174,7 +174,7 @@ def test_what_a_pooler_refuses_for_now_is_a_database_that_is_away(
                 ask_at_once(others[1], database)
         for other in others:
             other.close()
-        eventually(lambda: _or_none(database.revision), 10, "an answer once there is room")
+        eventually(lambda: _or_none(database.revision), what="an answer once there is room")
         database.close()
 
 

@@ -1,4 +1,4 @@
-"""The state machine of :mod:`tests.service.queue_model` on both databases: at least a thousand steps on each."""
+"""The state machine of :mod:`tests.service.queue_model` on both databases: a thousand steps on each, or 100,000."""
 
 from __future__ import annotations
 
@@ -20,3 +20,11 @@ def test_the_queue_holds_its_promises_on_sqlite(migrated_sqlite: Path, tmp_path:
 @pytest.mark.postgres
 def test_the_queue_holds_its_promises_on_postgresql(migrated_postgres: str) -> None:
     assert check(migrated_postgres, EXAMPLES) >= LEAST
+
+
+@pytest.mark.long
+@pytest.mark.timeout(4 * 3600)
+def test_the_queue_holds_its_promises_for_a_hundred_thousand_steps(url: str) -> None:
+    done = 0
+    while done < 100_000:
+        done += check(url, 50, steps=100)

