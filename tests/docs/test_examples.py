@@ -25,7 +25,7 @@ SHORTER = {
 """Chains that are too short for any number, and half of the runs: as good for whether the commands work."""
 MADE = {
     "docs/tutorial/first-grid.md": ["grid.json", "summary.json", "run.png", "biases.png"],
-    "docs/howto/paper-figure.md": ["figure.pdf"],
+    "docs/howto/paper-figure.md": ["figure.pdf", "HE0435.pdf"],
     "docs/howto/measure-an-image.md": ["host.json", "host.png"],
 }
 """Files that the examples of a page leave behind, beside their answers."""
@@ -41,7 +41,11 @@ def marked(page: Path) -> list[Block]:
 
 
 def pages_that_run(where: str) -> list[Path]:
-    return [page for page in PAGES if any(block.mark == f"run: {where}" for block in marked(page))]
+    """Pages whose examples need a ``service``, or nothing but the ``engine``."""
+    needs = {page: {block.mark for block in marked(page)} - {"answer"} for page in PAGES}
+    if where == "engine":
+        return [page for page, marks in needs.items() if marks == {"run: engine"}]
+    return [page for page, marks in needs.items() if f"run: {where}" in marks]
 
 
 def answers(told: str, output: str) -> bool:
