@@ -25,7 +25,7 @@ UWS_PHASES: dict[str, UwsPhase] = {
 
 
 class _Answer(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
 
 class Place(_Answer):
