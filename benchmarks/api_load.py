@@ -30,7 +30,6 @@ import psutil
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
-from service.store.migrate import upgrade
 from service.store.queue import RunQueue
 from tests.drills.installation import eventually, free_port
 from tests.service.plans import planned, result_of
@@ -41,6 +40,13 @@ DONE = 100
 RATE = 20.0
 CLIENTS = 50
 _UNDER_WAY = "hostlens_http_requests_in_progress"
+_FILL = """
+import sys
+from benchmarks.api_load import fill
+from service.store.migrate import upgrade
+upgrade(sys.argv[1])
+print(*fill(sys.argv[1]))
+"""
 _SERVE = """
 import signal, threading
 from service.runtime.settings import Settings
@@ -74,6 +80,17 @@ def fill(url: str) -> tuple[str, str]:
     finish(database, DONE)
     run = next(item.id for item in GridStore(database).runs(grid, RUNS).items if item.state == "done")
     database.close()
+    return grid, run
+
+
+def filled(tree: Path, url: str) -> tuple[str, str]:
+    """The same by the code of a checkout, whose tables may be others."""
+    command = [sys.executable, "-c", _FILL, url]
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    told = subprocess.run(
+        command, env=environment, cwd=tempfile.gettempdir(), check=True, stdout=subprocess.PIPE, text=True
+    )
+    grid, run = told.stdout.split()
     return grid, run
 
 
@@ -232,8 +249,7 @@ def probe(port: int, seconds: float) -> list[float]:
 def measure(tree: Path, options: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as folder:
         url = f"sqlite:///{folder}/load.sqlite"
-        upgrade(url)
-        grid, run = fill(url)
+        grid, run = filled(tree, url)
         port = free_port()
         settings = {
             "HOSTLENS_DATABASE_URL": url,
@@ -246,7 +262,7 @@ def measure(tree: Path, options: argparse.Namespace) -> None:
         busy = ("-m", "benchmarks.api_load", "--finish", url)
         with started("-c", _SERVE, **settings) as api:
             addresses = check(base, grid, run)
-            with started(*busy, PYTHONPATH=str(ROOT)):
+            with started(*busy, PYTHONPATH=str(tree)):
                 print(f"{tree}\n{'':18s} answers    1/s   p50 ms   p99 ms   max ms   CPU ms")
                 for name, address in addresses.items():
                     load(port, address, options.clients, 1.0)

@@ -26,7 +26,6 @@ from engine.imaging.geometry import Geometry
 
 _BALANCING_STEPS = 200
 _EVENNESS = 1e-4
-_SHARING_KERNELS = ("square", "turbo")
 
 
 def pixel_map(geometry: Geometry, index: int) -> FloatArray:
@@ -53,24 +52,20 @@ def _add(sum_: Drizzle, exposure: FloatArray, geometry: Geometry, index: int, we
     )
 
 
-def drizzle(exposures: FloatArray, geometry: Geometry, weights: FloatArray | None = None) -> FloatArray:
-    """Drizzle exposures onto the output grid, by the package in its single precision.
+def drizzle(exposures: FloatArray, geometry: Geometry) -> FloatArray:
+    """Drizzle exposures onto the output grid with :func:`even_weights`, by the package in its single precision.
 
     Parameters
     ----------
     exposures
         (n_dither, ny, nx) flux per native pixel.
-    weights
-        Weight maps of the same shape; those of :func:`even_weights` where None.
 
     Returns
     -------
     geometry.drizzled_shape, flux per drizzled pixel; NaN where no droplet falls.
     """
     _check_exposures(exposures, geometry)
-    if weights is not None and weights.shape != exposures.shape:
-        raise ObservationError(f"drizzle weights: got shape {weights.shape}, allowed is {exposures.shape}")
-    maps = even_weights(geometry) if weights is None else weights
+    maps = even_weights(geometry)
     total = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True)
     for index, exposure in enumerate(exposures):
         _add(total, exposure, geometry, index, maps[index])
@@ -88,8 +83,7 @@ def even_weights(geometry: Geometry) -> FloatArray:
     """Weight maps (n_dither, ny, nx) under which each native pixel well inside the image keeps its flux.
 
     Found by balancing W in the manner of Sinkhorn: its rows are weighted means whatever the weights, and the weights
-    are divided by what their pixels gain until none gains more than 1e-4. The point and Gaussian kernels, which do not
-    share out a pixel's flux in the first place, keep equal weights. Read-only; kept in memory.
+    are divided by what their pixels gain until none gains more than 1e-4. Read-only; kept in memory.
     """
     equal = _equal_weight_matrix(geometry)
     inside = np.stack([_well_inside(geometry, index) for index in range(geometry.n_dither)])
@@ -97,7 +91,7 @@ def even_weights(geometry: Geometry) -> FloatArray:
     flat, chosen = weights.reshape(-1), inside.ravel()
     rows = np.asarray(equal.sum(axis=1)).ravel()
     transposed = equal.T.tocsr()
-    for _ in range(_BALANCING_STEPS if geometry.kernel in _SHARING_KERNELS else 0):
+    for _ in range(_BALANCING_STEPS):
         gain = geometry.n_dither * flat * (transposed @ (rows / (equal @ flat)))
         if not chosen.any() or np.abs(gain[chosen] - 1.0).max() < _EVENNESS:
             break
@@ -168,8 +162,7 @@ def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
 def _impulse_spacing(geometry: Geometry) -> int:
     """Distance in native pixels at which the footprints of two impulses share no drizzled pixel.
 
-    A droplet is pixfrac wide (the Gaussian kernel is cut at 2.5 sigma, 2.2 pixfrac) and reaches every
-    drizzled pixel that it touches, or at least the nearest one.
+    A droplet is pixfrac wide and reaches every drizzled pixel that it touches, or at least the nearest one.
     """
     return math.ceil(2.2 * geometry.pixfrac + geometry.drizzle_ratio) + 1
 
@@ -185,14 +178,6 @@ def _nearest(axis: int, geometry: Geometry, index: int, step: int) -> list[np.nd
         impulse = np.clip(np.rint((position - phase) / step), 0, max(last, 0))
         result.append((phase + step * impulse).astype(np.intp))
     return result
-
-
-def drizzled_variance(variance: FloatArray, geometry: Geometry) -> FloatArray:
-    """Variance of every drizzled pixel, of geometry.drizzled_shape, from that of the exposures: (W o W) v."""
-    _check_exposures(variance, geometry)
-    weights = drizzle_weights(geometry)
-    squared = sparse.csr_matrix((weights.data**2, weights.indices, weights.indptr), shape=weights.shape)
-    return np.asarray(squared @ variance.ravel()).reshape(geometry.drizzled_shape)
 
 
 def drizzled_covariance(variance: FloatArray, geometry: Geometry) -> sparse.csr_matrix:

@@ -58,7 +58,8 @@ def autocorrelation_time(samples: FloatArray) -> float:
     """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters).
 
     The autocovariance about the mean of the whole ensemble is averaged over the walkers before it is normalised, so
-    that a walker that is stuck counts as what it is. Infinite where nothing has moved.
+    that a walker that is stuck counts as what it is: emcee's own estimate is NaN for a walker that has not moved and
+    1.0 for one that is stuck (benchmarks/LEDGER.md). Infinite where nothing has moved.
     """
     steps = samples.shape[0]
     away = samples - samples.mean(axis=(0, 1))

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Path
 
 from engine import SpecError
 from service import VERSION
+from service.api.links import link_system
 from service.domain.requests import engine_view, list_cameras, list_systems, system_view
 from service.domain.views import CameraList, EngineView, SystemList, SystemView
 from service.store.grids import NotFoundError
@@ -19,14 +20,14 @@ router = APIRouter(prefix="/v1", tags=["catalogue"])
 @router.get("/systems")
 async def systems() -> SystemList:
     """The lens systems that a grid may name."""
-    return SystemList(items=list_systems())
+    return SystemList(items=[link_system(found) for found in list_systems()])
 
 
 @router.get("/systems/{name}")
 async def system(name: Annotated[str, Path(max_length=64)]) -> SystemView:
     """One lens system with source and confidence of every number."""
     try:
-        return system_view(name)
+        return link_system(system_view(name))
     except SpecError as error:
         raise NotFoundError(str(error)) from error
 

@@ -13,6 +13,7 @@ from starlette.types import Receive, Scope, Send
 
 from service.api.context import Context, GridId, Limit, Service
 from service.api.hub import Feed, FullError
+from service.api.links import link_grid
 from service.api.pages import next_link
 from service.api.threads import QUICK, Route, run_in
 from service.domain.views import EventPage
@@ -80,7 +81,7 @@ async def _stream(service: Context, grid_id: str, after: int | None) -> Response
         if after is None or await run_in(QUICK, service.events.lacks, grid_id, after):
             # The number before the state: what comes between the two is told twice and not lost.
             after = await run_in(QUICK, service.events.latest, grid_id)
-            grid = await run_in(QUICK, service.grids.grid, grid_id)
+            grid = link_grid(await run_in(QUICK, service.grids.grid, grid_id))
             first = [format_sse_event(event="grid", id=str(after), data_str=grid.model_dump_json())]
         else:
             page = await run_in(QUICK, service.events.page, grid_id, after, 1)

@@ -14,6 +14,7 @@ from engine import engine_digest
 from service.api.bodies import JsonRoute
 from service.api.context import GridId, Limit, RunId, Service
 from service.api.downloads import artefact
+from service.api.links import link_document, link_grid, link_grids, link_runs
 from service.api.pages import next_link
 from service.api.threads import patient
 from service.domain.identifiers import GRID_PATTERN
@@ -55,8 +56,9 @@ def submit(
         engine_digest(),
     )
     _LOG.info("replayed" if made.replayed else "accepted", extra={"grid": made.grid.id, "runs": made.grid.n_runs})
-    headers = {"Location": made.grid.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
-    return JSONResponse(made.grid.model_dump(mode="json"), status_code=202, headers=headers)
+    grid = link_grid(made.grid)
+    headers = {"Location": grid.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
+    return JSONResponse(grid.model_dump(mode="json"), status_code=202, headers=headers)
 
 
 @router.get("/grids")
@@ -69,13 +71,13 @@ def list_grids(
 ) -> GridPage:
     """Grids, newest first."""
     page = service.grids.grids(limit, cursor)
-    return page.model_copy(update={"next": next_link(request, response, page.next)})
+    return GridPage(items=link_grids(page.items), next=next_link(request, response, page.next))
 
 
 @router.get("/grids/{grid_id}", response_model=GridView)
 def show_grid(grid_id: GridId, service: Service) -> Response:
     """One grid: its runs by state, rate and time left."""
-    return _written(service.grids.grid(grid_id))
+    return _written(link_grid(service.grids.grid(grid_id)))
 
 
 @router.get("/grids/{grid_id}/runs")
@@ -90,7 +92,7 @@ def list_runs(
 ) -> RunPage:
     """A grid's runs in its order."""
     page = service.grids.runs(grid_id, limit, -1 if cursor is None else cursor, state)
-    return page.model_copy(update={"next": next_link(request, response, page.next)})
+    return RunPage(items=link_runs(page.items), next=next_link(request, response, page.next))
 
 
 @router.get("/grids/{grid_id}/summary", response_model=Summary)
@@ -116,32 +118,32 @@ def _written(document: Any, headers: dict[str, str] | None = None) -> Response:
 @router.post("/grids/{grid_id}/cancel")
 def cancel(grid_id: GridId, service: Service) -> GridView:
     """Cancel a grid: queued runs at once, running ones as soon as the dispatcher sees it."""
-    return service.grids.cancel(grid_id)
+    return link_grid(service.grids.cancel(grid_id))
 
 
 @router.post("/grids/{grid_id}/pause")
 def pause(grid_id: GridId, service: Service) -> GridView:
     """Pause a grid: no queued run is started any more; running ones end as they would."""
-    return service.grids.pause(grid_id)
+    return link_grid(service.grids.pause(grid_id))
 
 
 @router.post("/grids/{grid_id}/resume")
 def resume(grid_id: GridId, service: Service) -> GridView:
     """Resume a paused grid."""
-    return service.grids.resume(grid_id)
+    return link_grid(service.grids.resume(grid_id))
 
 
 @router.post("/grids/{grid_id}/retry")
 def retry(grid_id: GridId, service: Service) -> GridView:
     """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts."""
     service.grids.revive(grid_id)
-    return service.grids.grid(grid_id)
+    return link_grid(service.grids.grid(grid_id))
 
 
 @router.get("/runs/{run_id}", response_model=RunDetail)
 def show_run(run_id: RunId, service: Service) -> Response:
     """One run: specification, state, result, attempts."""
-    return _written(service.grids.run_document(run_id))
+    return _written(link_document(service.grids.run_document(run_id)))
 
 
 @router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]

@@ -295,6 +295,24 @@ def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
         _tell(client.retry(grid))
 
 
+@app.command()
+def check(
+    database_url: Annotated[
+        str | None, typer.Option("--database", help="URL of an empty database; a SQLite file of its own without")
+    ] = None,
+) -> None:
+    """See whether this installation keeps its promise: processes are killed, each result is stored once; 2 minutes."""
+    from service.cli.check import check as carry_out  # noqa: PLC0415 - loads SQLAlchemy
+    from service.runtime import preflight  # noqa: PLC0415 - as above
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
+    if database_url is not None:
+        preflight.require_database(_settings(database_url=database_url))
+    with _migrating():
+        code = carry_out(_console(), database_url)
+    raise typer.Exit(code)
+
+
 @database.command("upgrade")
 def db_upgrade(revision: Annotated[str, typer.Argument(help="Which; the newest without")] = "head") -> None:
     """Bring the database to a newer schema, by default the newest; may be repeated, by several at once."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
+from pathlib import Path
 from types import FrameType
 
 import httpx
@@ -19,9 +20,11 @@ from service.cli.formatting import duration, summary_table
 from service.cli.watch import Show, progress
 from service.client import Client, ClientError
 from service.domain.views import GridView
+from service.runtime import preflight
+from service.runtime.installation import DidNotHappenError, Installation, eventually, free_port
 from service.runtime.settings import Settings
 from service.runtime.start import STOPS
-from service.runtime.supervisor import Supervisor
+from service.runtime.supervisor import as_environment
 from service.store.artefacts import ArtefactStore
 
 REQUEST = {
@@ -43,26 +46,23 @@ def demo(settings: Settings, console: Console, timeout_s: float = 3600.0) -> int
     """
     began = time.monotonic()
     folder = settings.data_dir.absolute() / f"demo-{datetime.now().astimezone():%Y%m%d-%H%M%S}-{os.getpid()}"
-    own = {
-        "data_dir": folder,
-        "database_url": None,
-        "artefact_url": None,
-        "host": "127.0.0.1",
-        "port": _free_port(),
-    }
+    own = {"data_dir": folder, "database_url": None, "artefact_url": None, "host": "127.0.0.1"}
     settings = settings.model_copy(update=own)
-    with _running(settings) as stop, Client(f"http://127.0.0.1:{settings.port}") as client:
+    preflight.require_data(settings)
+    with _running(folder, settings) as (service, stop):
+        client = service.client
         said = f"API, dispatcher and {settings.workers} workers; data in {folder}"
         console.print(said, highlight=False, soft_wrap=True)
         try:
-            _wait_ready(client, stop)
-            console.print(f"ready after {duration(time.monotonic() - began)}: http://127.0.0.1:{settings.port}")
+            eventually(lambda: stop.is_set() or service.is_ready(), _READY_S, "readiness")
+            stop.require_unset()
+            console.print(f"ready after {duration(time.monotonic() - began)}: http://127.0.0.1:{service.port}")
             grid = client.submit(REQUEST)
             console.print(f"submitted {grid.id}: {grid.n_runs} runs", highlight=False)
             with progress(console) as show:
                 grid = client.wait(grid.id, _until(stop, show), timeout_s=timeout_s)
             _report(console, client, settings, grid)
-        except (ClientError, httpx.RequestError, TimeoutError, _StoppedError) as error:
+        except (ClientError, httpx.RequestError, TimeoutError, DidNotHappenError, _StoppedError) as error:
             console.print(f"the demo ends early: {error}", markup=False, soft_wrap=True)
             return 128 + stop.number if stop.number else 1
     console.print(f"wall time {duration(time.monotonic() - began)}; all processes have ended")
@@ -95,49 +95,33 @@ class _Wanted(threading.Event):
         self.number = number
         self.set()
 
+    def require_unset(self) -> None:
+        """Go no further once it is set."""
+        if self.is_set():
+            raise _StoppedError("interrupted")
 
-def _until(stop: threading.Event, show: Show) -> Show:
+
+def _until(stop: _Wanted, show: Show) -> Show:
     def shown(grid: GridView) -> None:
         show(grid)
-        if stop.is_set():
-            raise _StoppedError("interrupted")
+        stop.require_unset()
 
     return shown
 
 
 @contextmanager
-def _running(settings: Settings) -> Iterator[_Wanted]:
+def _running(folder: Path, settings: Settings) -> Iterator[tuple[Installation, _Wanted]]:
     """The supervised service for as long as the context lasts; the event is set when the user wants to stop."""
-    supervisor = Supervisor(settings, log_folder=settings.data_dir)
-    supervisor.prepare()
-    wanted, end = _Wanted(), threading.Event()
+    variables = as_environment(settings.model_copy(update={"port": free_port()}))
+    wanted = _Wanted()
     before = {number: signal.signal(number, wanted.by_signal) for number in STOPS}
-    thread = threading.Thread(target=supervisor.run, args=(end,), name="supervisor")
-    thread.start()
+    unset = [name for name in os.environ if name.startswith("HOSTLENS_")]
+    service = Installation(folder, variables, without=unset)
     try:
-        yield wanted
+        yield service, wanted
     finally:
-        end.set()
-        thread.join()
+        with suppress(subprocess.TimeoutExpired):
+            service.end(signal.SIGTERM)
+        service.kill_all()
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _wait_ready(client: Client, stop: threading.Event) -> None:
-    until = time.monotonic() + _READY_S
-    while time.monotonic() < until:
-        try:
-            if client.readiness().status == "ready":
-                return
-        except (httpx.RequestError, ClientError):
-            pass  # the API is still starting
-        if stop.wait(0.2):
-            raise _StoppedError("interrupted")
-    raise TimeoutError(f"the service is not ready after {_READY_S:g} s")
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

@@ -15,6 +15,9 @@ _MOST = 64 * 2**20
 def read_request(path: Path) -> dict[str, Any]:
     """The JSON object in a file; a refusal that says what else is there."""
     try:
+        # A pipe without a writer would be waited for, for ever.
+        if path.exists() and not path.is_file():
+            raise _refusal(path, "is not a regular file")
         with path.open("rb") as file:
             data = file.read(_MOST + 1)
     except OSError as error:

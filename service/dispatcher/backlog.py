@@ -43,7 +43,7 @@ class NoRoomError(RuntimeError):
     """No more results can be kept."""
 
 
-class Holding:
+class Backlog:
     """Results whose artefacts have to be in the store before they are stored themselves.
 
     ``away`` says why the store takes nothing now, None while it does. With nothing to put the store is asked every ten

@@ -8,10 +8,11 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from service.dispatcher.attribution import Deaths
-from service.dispatcher.flights import Flight
+from service.dispatcher.flights import Flight, Flights
 from service.dispatcher.outcomes import memory_exceeded, worker_lost
 from service.dispatcher.pool import Pool
 from service.dispatcher.stalls import Stall
+from service.dispatcher.telemetry import DispatcherMetrics
 from service.dispatcher.writer import Writer
 from service.runtime import logs
 from service.store.leases import Outcome
@@ -22,9 +23,48 @@ _LOG = logging.getLogger(__name__)
 class Blame:
     """Turns runs that are on no worker any more into endings; ``deaths`` are those that are not judged yet."""
 
-    def __init__(self, endings: Writer) -> None:
+    def __init__(self, flights: Flights, endings: Writer, metrics: DispatcherMetrics) -> None:
         self.deaths: Deaths[Flight] = Deaths()
+        self._flights = flights
         self._endings = endings
+        self._metrics = metrics
+
+    def bury(self, address: str, pool: Pool) -> None:
+        """A worker died with what it was at."""
+        pool.forget(address)
+        flights = self._flights.take_on(address)
+        if pool.was_stopped(address) or pool.closed_on_purpose(address):
+            self.lose(flights, "the worker was stopped")
+            return
+        self._metrics.worker_deaths.inc()
+        answered = [flight for flight in flights if flight.answered]
+        under_way = [flight for flight in flights if not flight.answered]
+        _LOG.warning("worker %s died with %d runs", address, len(under_way))
+        # What had ended did not kill it, only its answer is lost.
+        self.lose(answered, "the worker died before its answer was fetched")
+        for flight in answered:
+            flight.memory.latest = None
+        self.deaths.add(under_way, time.monotonic())
+
+    def look_for_deaths(self, pool: Pool) -> None:
+        """Judge the dead, and give back what is on workers that are gone without Dask having blamed anyone."""
+        present = pool.present()
+        if present is not None and pool.running:
+            gone = self._flights.take_missing(present)
+            self.lose(gone, "the worker is gone")
+            for flight in gone:
+                flight.drop()
+        self.judge(pool)
+
+    def replace_stalled(self, pool: Pool) -> None:
+        """Start workers anew that are alive and take no work; what had been sent there goes back."""
+        stopped: dict[str, list[Flight]] = {}
+        for stall in pool.stalled(self._flights.oldest()):
+            flights = stopped[stall.address] = self._flights.take_on(stall.address)
+            self._metrics.workers_replaced.labels(stall.reason).inc()
+            _LOG.warning("worker %s is alive and takes no work, so it is replaced: %s", stall.address, stall.reason)
+            self._end_stalled(stall, flights)
+        pool.stop(stopped, [flight.future for flights in stopped.values() for flight in flights])
 
     def suspect(self, flights: Sequence[Flight], detail: str) -> None:
         """Runs one of which is to blame go back uncharged, to be tried one at a time."""
@@ -55,7 +95,7 @@ class Blame:
         if suspects:
             self.suspect(suspects, f"one of {len(suspects)} runs may have killed a worker")
 
-    def replaced(self, stall: Stall, flights: Sequence[Flight]) -> None:
+    def _end_stalled(self, stall: Stall, flights: Sequence[Flight]) -> None:
         """End the runs of a worker that was alive and took no work: uncharged, but for one that made it so."""
         begun = [flight for flight in flights if stall.begun and not flight.answered]
         if stall.reason == "silent":

@@ -25,14 +25,7 @@ class OtherEngine:
     digest: str
 
 
-def read_part(lease: Lease, answers: Any, place: int) -> ResultPayload | Failure | OtherEngine:
-    """What a worker's answers to several runs mean for one of them."""
-    if not isinstance(answers, list) or place >= len(answers):
-        return _invalid("the worker did not answer for every run that it was given")
-    return read_answer(lease, answers[place])
-
-
-def read_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEngine:
+def judge_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEngine:
     """What a worker's answer means for the run."""
     if not isinstance(answer, dict) or not {"payload", "error"} & set(answer):
         return _invalid("the worker's answer has neither a payload nor an error")
@@ -57,7 +50,7 @@ def _read_error(error: Any) -> Failure:
     return Failure(Outcome.ERROR, clean(error["code"], 64), clean(error.get("message", "")), retries)
 
 
-def read_artefacts(payload: ResultPayload, answers: Any, place: int) -> dict[str, bytes]:
+def read_artefacts(payload: ResultPayload, answer: dict[str, Any]) -> dict[str, bytes]:
     """The artefacts of a payload that came home with it because the store did not take them, by their keys.
 
     Raises
@@ -65,7 +58,7 @@ def read_artefacts(payload: ResultPayload, answers: Any, place: int) -> dict[str
     service.domain.payload.InvalidResultError
         They are not what the payload names.
     """
-    brought = answers[place].get("artefacts", {})
+    brought = answer.get("artefacts", {})
     if not isinstance(brought, dict):
         raise InvalidResultError("artefacts: they are not named by their keys")
     artefacts = {}

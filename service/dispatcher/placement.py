@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 
 from service.dispatcher.pool import Worker
-
-_SPREAD = 0.2
 
 
 class Slots:
@@ -18,8 +15,7 @@ class Slots:
     that engine takes no more runs.
     """
 
-    def __init__(self, lifetime_s: float | None = None) -> None:
-        self._lifetime_s = lifetime_s
+    def __init__(self) -> None:
         self._on: dict[str, set[str]] = {}
         self._kept: dict[str, str] = {}
         """Worker that is being emptied, by the engine of the suspect that it is for."""
@@ -72,15 +68,3 @@ class Slots:
     def no_suspects(self, engine: str) -> None:
         """None of the engine waits, so none of its workers has to be emptied for one."""
         self._kept.pop(engine, None)
-
-    def outlived(self, workers: Sequence[Worker], now: float) -> list[str]:
-        """Idle workers that are older than they may become: each at an age of its own, or all would go at once."""
-        if self._lifetime_s is None:
-            return []
-        old = []
-        for worker in workers:
-            die = hashlib.sha256(worker.address.encode()).digest()[0] / 255.0
-            lifetime = self._lifetime_s * (1.0 + _SPREAD * (2.0 * die - 1.0))
-            if now - worker.since > lifetime and not self._on.get(worker.address):
-                old.append(worker.address)
-        return old

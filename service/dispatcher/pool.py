@@ -9,12 +9,14 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 from uuid import uuid4
+
+from distributed.client import ClosedClientError
 
 from service.dispatcher.clusters import open_client
 from service.dispatcher.pickle_guard import read_error
@@ -23,7 +25,7 @@ from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.leases import Lease
 from service.worker.answers import NotPlainError, read_greeting
-from service.worker.tasks import call_tasks, greet
+from service.worker.tasks import answer_run, greet
 
 _LOG = logging.getLogger(__name__)
 _STOP_S = 5.0
@@ -59,8 +61,7 @@ class Pool:
         self._greetings: dict[str, Asked] = {}
         self._refused: set[str] = set()
         self._conditions: dict[str, Condition] = {}
-        self._patience_s = settings.worker_patience_s
-        self._stalls = Stalls(settings.worker_ttl_s, self._patience_s)
+        self._stalls = Stalls(settings.worker_ttl_s, settings.worker_patience_s)
         self._conditions_due = float("-inf")
         self._unfit: list[tuple[float, Stall]] = []
         self._failures = 0
@@ -125,11 +126,10 @@ class Pool:
         except (OSError, NotPlainError, TypeError, ValueError, KeyError):
             return None
 
-    def submit(self, leases: Sequence[Lease], worker: Worker) -> Any:
-        """Start runs, one after the other as one task; the future of their answers, in the same order."""
-        specs = [lease.spec for lease in leases]
-        fields = [logs.fields_of(lease) for lease in leases]
-        return self._on(worker.address, leases[0].key, call_tasks, specs, self._settings.artefacts, fields)
+    def submit(self, lease: Lease, worker: Worker) -> Any:
+        """Start a run; the future of its answer."""
+        fields = logs.fields_of(lease)
+        return self._on(worker.address, lease.key, answer_run, lease.spec, self._settings.artefacts, fields)
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""
@@ -152,7 +152,7 @@ class Pool:
         self._workers.pop(address, None)
 
     def closed_on_purpose(self, address: str) -> bool:
-        """Whether a worker that is gone was told to go (a signal, the end of its lifetime) and did not die."""
+        """Whether a worker that is gone was told to go (by a signal, say) and did not die."""
         try:
             events = self._client.get_events(address)
         except (OSError, TimeoutError, NotPlainError, RuntimeError):
@@ -180,16 +180,20 @@ class Pool:
             raise OSError(f"the scheduler cannot be asked: {error}") from error
 
     def _on(self, address: str, key: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        return self._client.submit(
-            function,
-            self._settings.task,
-            *arguments,
-            key=key,
-            workers=[address],
-            allow_other_workers=False,
-            pure=False,
-            retries=0,
-        )
+        """The future of a call on a worker; OSError where the scheduler has gone."""
+        try:
+            return self._client.submit(
+                function,
+                self._settings.task,
+                *arguments,
+                key=key,
+                workers=[address],
+                allow_other_workers=False,
+                pure=False,
+                retries=0,
+            )
+        except ClosedClientError as error:
+            raise OSError(f"the scheduler cannot be given anything: {error}") from error
 
     def _look(self) -> None:
         now = time.monotonic()
@@ -219,8 +223,7 @@ class Pool:
     def _greet(self, address: str, threads: int, now: float, passed: float) -> None:
         """Ask a new worker what it carries; until it has answered it gets no run, and if it does not it is replaced."""
         if address not in self._greetings:
-            greeting = self._on(address, f"greet-{uuid4().hex}", greet)
-            self._greetings[address] = Asked(greeting, now, self._patience_s)
+            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet), now)
         asked = self._greetings[address]
         if not asked.future.done():
             if asked.has_stalled(self._conditions.get(address), passed, now):
@@ -249,7 +252,7 @@ class Pool:
 
     def _stop(self, addresses: list[str], futures: list[Any]) -> None:
         # KeyError: a worker that is gone.
-        with suppress(TimeoutError, OSError, KeyError, NotPlainError):
+        with suppress(TimeoutError, OSError, KeyError, NotPlainError, ClosedClientError):
             if futures:
                 self._client.cancel(futures, force=True)
             if not addresses:

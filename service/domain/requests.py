@@ -44,8 +44,8 @@ from engine import (
     system_facts,
     system_names,
 )
+from service.domain.plan import PlannedRun
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
-from service.store.submission import PlannedRun
 
 CONFIGURATIONS = {2: "double", 4: "quad"}
 """What a lens with so many AGN images is called; any other is ``other``."""
@@ -234,7 +234,7 @@ def _system_fields(name: str) -> dict[str, Any]:
         "name": name,
         "camera": system.camera_name,
         "mass_models": {model: sorted(map(float, slopes)) for model, slopes in system.mass_models.items()},
-        "links": {"self": f"/v1/systems/{name}"},
+        "links": {},
     }
 
 

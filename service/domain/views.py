@@ -24,6 +24,10 @@ UWS_PHASES: dict[str, UwsPhase] = {
 """States in the words of the IVOA's Universal Worker Service."""
 
 
+Links = dict[str, str]
+"""Addresses by what they lead to: none before the API, which alone knows them, has filled them in."""
+
+
 class _Answer(BaseModel):
     model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
@@ -88,7 +92,7 @@ class GridView(_Answer):
     engine_digest: str | None
     """Of the engine whose results the grid takes: the one that was installed where it was submitted."""
     request: dict[str, Any]
-    links: dict[str, str]
+    links: Links
 
 
 class GridPage(_Answer):
@@ -130,7 +134,7 @@ class RunView(_Answer):
     """It may have killed a worker, and is only run alone."""
     error: RunError | None
     finished_at: datetime | None
-    links: dict[str, str]
+    links: Links
 
 
 class RunPage(_Answer):
@@ -332,7 +336,7 @@ class SystemItem(_Answer):
     camera: str
     mass_models: dict[str, list[float]]
     """l_eta of each mass model by its name."""
-    links: dict[str, str]
+    links: Links
 
 
 class SystemList(_Answer):

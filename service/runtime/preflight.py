@@ -61,6 +61,8 @@ def require_database(settings: Settings) -> None:
 def require_artefacts(settings: Settings, *, written: bool = False) -> None:
     """The protocol of the artefact store, and its folder where this machine's workers write to it."""
     protocol, path = fsspec.core.split_protocol(settings.artefacts)
+    if protocol in {"http", "https"}:
+        raise ConfigurationError(f"HOSTLENS_ARTEFACT_URL: {protocol} takes no files; allowed is a folder or a bucket")
     try:
         fsspec.get_filesystem_class(protocol)
     except (ValueError, ImportError) as error:
@@ -98,6 +100,11 @@ def require_certificates(settings: Settings) -> None:
     """The files of TLS are there, are PEM, and belong together."""
     if settings.tls_ca is None or settings.tls_cert is None:
         return
+    for name in ("tls_ca", "tls_cert", "tls_key"):
+        file = getattr(settings, name)
+        if file is not None and file.exists() and not file.is_file():
+            # A pipe without a writer would be waited for, for ever.
+            raise ConfigurationError(f"HOSTLENS_{name.upper()}: {file} is not a regular file")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     variables = "HOSTLENS_TLS_CA"
     try:

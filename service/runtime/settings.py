@@ -118,17 +118,13 @@ class Settings(LogSettings):
     kubernetes_image: str = "hostlens:latest"
     kubernetes_memory: KubernetesMemory = "4Gi"
     window: Annotated[int, Field(ge=1, le=100_000)] | None = None
-    """Runs claimed at most; one per worker thread (or ``batch``), and one more where they are short, where None."""
-    batch: Annotated[int, Field(ge=1, le=1000)] = 1
-    """Runs that a worker thread is given at a time: more than one where runs take less than about a second."""
+    """Runs in flight at most; one per worker thread where None."""
     worker_memory: WorkerMemory = "auto"
     """Memory of a worker of the local cluster, as ``2GiB``; beyond it the worker is ended."""
-    worker_lifetime_s: Seconds | None = None
-    """A worker older than this is started anew once it is idle, each at its own time within a fifth of it."""
     worker_ttl_s: Annotated[float, Field(ge=10.0, le=86400.0)] = 60.0
     """A worker that says nothing for so long is started anew."""
     worker_patience_s: Annotated[float, Field(ge=4.0, le=86400.0)] = 20.0
-    """A worker that is alive and takes no work for so long is replaced; twice as long for one that is not greeted."""
+    """A worker that is alive and takes no work for so long is replaced."""
 
     metrics_host: Host = "127.0.0.1"
     metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None

@@ -11,12 +11,10 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from threading import Event, Thread
-from typing import IO
 
 import httpx
 
@@ -68,10 +66,8 @@ class Supervisor:
         self,
         settings: Settings,
         modules: tuple[str, ...] = (API, "service.dispatcher"),
-        log_folder: Path | None = None,
     ) -> None:
         self._settings = settings
-        self._log_folder = log_folder
         counts = {API: settings.api_processes}
         self._children = [_Child(module, number) for module in modules for number in range(counts.get(module, 1))]
         self._serves_api = API in modules
@@ -135,29 +131,18 @@ class Supervisor:
 
     def _start(self, child: _Child) -> None:
         given, descriptors = self._given(child)
-        environment = {**os.environ, **given, **_as_environment(self._settings)}
-        with self._log(child) as log, start.kept_back():
+        environment = {**os.environ, **given, **as_environment(self._settings)}
+        with start.kept_back():
             child.process = subprocess.Popen(
                 [sys.executable, "-m", child.module],
                 env=environment,
                 stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
                 pass_fds=descriptors,
                 start_new_session=True,
             )
         child.started = time.monotonic()
         child.starts += 1
         _LOG.info("%s runs as process %d", child.module, child.process.pid)
-
-    @contextmanager
-    def _log(self, child: _Child) -> Iterator[IO[bytes] | None]:
-        """Where a child writes: a file of its own in the log folder, or this process's own output."""
-        if self._log_folder is None:
-            yield None
-            return
-        with (self._log_folder / f"{child.module}.log").open("ab") as log:
-            yield log
 
     def _announce(self, ended: Event, serves: Callable[[], None]) -> None:
         """Ask until the service answers and has a leader, be it one of another machine."""
@@ -229,7 +214,7 @@ def _end_group(process: subprocess.Popen[bytes]) -> None:
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def _as_environment(settings: Settings) -> dict[str, str]:
+def as_environment(settings: Settings) -> dict[str, str]:
     """The settings as the variables that the children read, so that all agree whatever came from the command line."""
     values = settings.model_dump(mode="json", exclude_none=True)
     plain = {name: json.dumps(value) if isinstance(value, list) else str(value) for name, value in values.items()}

@@ -16,6 +16,8 @@ _SQLITE, _POSTGRES = (
     frozenset({"postgresql", "postgres", "postgresql+psycopg"}),
 )
 _SQLITE_OPTIONS = {"uri": {"true", "1"}, "mode": {"ro", "rw"}, "immutable": {"0", "1"}, "nolock": {"0", "1"}}
+_SURROGATE = re.compile("[\ud800-\udfff]")
+"""Half a character, which stands for bytes that are no text."""
 _HOSTS = re.compile(r"(?P<before>[\w+]+://(?:[^@]*@)?)(?P<hosts>[^@/?]*,[^@/?]*)(?P<after>[/?].*)?", re.DOTALL)
 _HOST = re.compile(r"(?P<host>\[[^\]]*\]|[^:]*)(?::(?P<port>\d*))?")
 _NUMBERS = frozenset(
@@ -87,7 +89,7 @@ def read_address(text: str) -> SqliteAddress | PostgresAddress:
         Another kind of database, or an option that is unknown or has no such value.
     """
     # What follows a NUL the drivers' C code does not see: the host, say.
-    if "\x00" in unquote(text) or not _is_unicode(text):
+    if "\x00" in unquote(text) or _SURROGATE.search(text):
         raise AddressError("the database URL has a NUL or what is no Unicode")
     several = _HOSTS.fullmatch(text)
     try:
@@ -174,14 +176,6 @@ def _require_ports(ports: list[str]) -> None:
     for port in ports:
         if port and not (re.fullmatch(r"[0-9]{1,5}", port) and 0 < int(port) < 65536):
             raise AddressError(f"the database URL has the port {port[:80]!r}; one of 1 to 65535 is expected")
-
-
-def _is_unicode(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _once(name: str, value: str | tuple[str, ...]) -> str:

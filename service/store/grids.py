@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, bindparam, false, func, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    bindparam,
+    case,
+    false,
+    func,
+    literal_column,
+    select,
+    update,
+)
 from sqlalchemy.exc import IntegrityError
 
 from service.domain.identifiers import utc_now
+from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leases import add_event, lock_grids
-from service.store.pace import progress, recent
+from service.store.pace import recent, recent_of
 from service.store.pieces import Turns
 from service.store.rows import (
     ATTEMPT_COLUMNS,
@@ -29,15 +41,25 @@ from service.store.rows import (
     run_view,
 )
 from service.store.settling import IS_OPEN, settle
-from service.store.submission import Plan, Submission, give_up, store
+from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
 from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""
 _BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
+
+
+def _run_counts() -> Iterator[ColumnElement[int]]:
+    """Runs of a grid in each state, by a look at the index alone; none where they were written down at its end."""
+    for state in RunState:
+        mine = (run.c.grid_id == grid.c.id) & (run.c.state == literal_column(f"'{state}'"))
+        counted = select(func.count()).select_from(run).where(mine).correlate(grid).scalar_subquery()
+        yield case((grid.c.ending.is_(None), counted)).label(f"{state}_runs")
+
+
 # Made once: to make a statement takes as long as to carry it out.
-_GRID = select(grid).where(grid.c.id == bindparam("wanted"), WHOLE)
+_GRID = select(grid, *_run_counts()).where(grid.c.id == bindparam("wanted"), WHOLE)
 _COUNTS = (
     select(run.c.grid_id, run.c.state, func.count().label("runs"))
     .where(run.c.grid_id.in_(bindparam("ids", expanding=True)))
@@ -265,8 +287,8 @@ class GridStore:
             raise NotFoundError(f"there is no grid {grid_id}")
         if row.ending is not None:
             return ended_grid_view(row)
-        counts, latest = progress(connection, grid_id)
-        return grid_view(row, counts, latest, self._clock())
+        counts = {str(state): row._mapping[f"{state}_runs"] for state in RunState}
+        return grid_view(row, counts, recent_of(connection, grid_id), self._clock())
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()

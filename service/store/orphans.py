@@ -7,6 +7,7 @@ that of the last. A store belongs to one database: what another's results refer 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -17,7 +18,10 @@ import fsspec
 from service.store.artefacts import KEY
 
 REFERRED, YOUNG, FOREIGN = "a result refers to it", "younger, or of a run that is under way", "not of hostlens"
-_PARTIAL = ".partial"
+DAMAGED = "in a folder that lay where an artefact belongs"
+_PARTIAL = re.compile(r"\.partial$|^\.probe$")
+"""What a write, or a look whether the store takes one, may leave behind."""
+_DAMAGED = re.compile(r"\.damaged(/|$)")
 _DAY = timedelta(days=1)
 _CLOCKS = timedelta(hours=1)
 """By so much the clocks of store, database and dispatcher may disagree."""
@@ -73,11 +77,11 @@ class Orphans:
         """Tell what is to go from what stays. ``referred`` is read after the listing, and so knows of all it saw."""
         found = Found()
         for name, size, old in listed:
-            is_artefact, is_partial = KEY.match(name) is not None, name.endswith(_PARTIAL)
+            is_artefact, is_partial = KEY.match(name) is not None, _PARTIAL.search(name) is not None
             if name in referred:
                 found.keep(REFERRED, size)
             elif not (is_artefact or is_partial):
-                found.keep(FOREIGN, size)
+                found.keep(DAMAGED if _DAMAGED.search(name) else FOREIGN, size)
             elif not old:
                 found.keep(YOUNG, size)
             else:

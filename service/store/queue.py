@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import random
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
@@ -9,7 +11,20 @@ from datetime import datetime, timedelta
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, exists, false, func, literal_column, or_, select, true, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Text,
+    cast,
+    exists,
+    false,
+    func,
+    literal_column,
+    or_,
+    select,
+    true,
+    update,
+)
 
 from service.domain.identifiers import new_token, utc_now
 from service.domain.payload import ResultPayload
@@ -41,6 +56,7 @@ from service.store.tables import attempt, estimate, grid, result, run
 from service.store.transitions import move, moving
 from service.store.upkeep import Upkeep
 
+_LOG = logging.getLogger(__name__)
 _MAX_DELAY_S = 600.0
 _JITTER = (0.5, 1.5)
 _DOUBLINGS = 12
@@ -130,13 +146,26 @@ class RunQueue:
         with self._database.write() as connection:
             require_generation(connection, generation)
             rows = connection.execute(taken).all()
-        return [
-            Lease(
-                row.id, row.grid_id, row.attempt, token, generation, row.digest, row.spec, now,
+        leases = []
+        for row in sorted(rows, key=lambda row: (row.not_before, row.id)):
+            spec = _read_spec(row.spec)
+            lease = Lease(
+                row.id, row.grid_id, row.attempt, token, generation, row.digest, spec or {}, now,
                 row.engine_digest, row.suspect, row.kind,
-            )
-            for row in sorted(rows, key=lambda row: (row.not_before, row.id))
-        ]  # fmt: skip
+            )  # fmt: skip
+            if spec is None:
+                # In a transaction of its own, because grids are locked before runs. A crash before it leaves a lease
+                # that nobody knows of, which goes back to the queue and comes here again.
+                self._refuse_spec(lease)
+            else:
+                leases.append(lease)
+        return leases
+
+    def _refuse_spec(self, lease: Lease) -> None:
+        """End a run whose specification nobody can read: it keeps no other from being claimed."""
+        detail = "the stored specification is not a JSON object"
+        _LOG.error("run %s fails: %s", lease.run_id, detail)
+        self.fail(lease, Failure(Outcome.ERROR, "invalid_spec", detail, retries=0))
 
     def store(self, lease: Lease, payload: ResultPayload) -> Stored:
         """Store a result if the lease is still valid.
@@ -326,18 +355,11 @@ class RunQueue:
     def _later_than(now: datetime, delay: timedelta) -> ColumnElement[bool]:
         return run.c.not_before > now + _SLACK + delay * _JITTER[1]
 
-    def to_hold(self, generation: int) -> set[Pair]:
-        """Runs leased in this generation whose grid has been paused, each with its token."""
-        return self._leased_where(generation, grid.c.paused_at.is_not(None))
-
     def to_cancel(self, generation: int) -> set[Pair]:
         """Runs leased in this generation whose grid has been cancelled, each with its token."""
-        return self._leased_where(generation, grid.c.cancelled_at.is_not(None))
-
-    def _leased_where(self, generation: int, condition: ColumnElement[bool]) -> set[Pair]:
         with self._database.read() as connection:
-            called = run.c.grid_id.in_(select(grid.c.id).where(condition, _OPEN))
-            return self._leased_now(connection, generation, called)
+            cancelled = select(grid.c.id).where(grid.c.cancelled_at.is_not(None), _OPEN)
+            return self._leased_now(connection, generation, run.c.grid_id.in_(cancelled))
 
     @staticmethod
     def _leased_now(connection: Connection, generation: int, *where: ColumnElement[bool]) -> set[Pair]:
@@ -393,11 +415,21 @@ _CLAIMED = (
     run.c.attempt,
     run.c.digest,
     run.c.kind,
-    run.c.spec,
+    # As text, or one row that is no JSON would make the whole claim fail, again and again.
+    cast(run.c.spec, Text).label("spec"),
     run.c.suspect,
     run.c.not_before,
     _ENGINE.label("engine_digest"),
 )
+
+
+def _read_spec(text: str) -> dict[str, Any] | None:
+    """A specification as it was stored; None where it is no JSON object, which only a change by hand can make it."""
+    try:
+        spec = json.loads(text)
+    except ValueError:
+        return None
+    return spec if isinstance(spec, dict) else None
 
 
 def _ready(now: datetime, engine: str | None, suspects: bool) -> ColumnElement[bool]:

@@ -1,4 +1,4 @@
-"""Rows as the API's models."""
+"""Rows as the domain's views."""
 
 from __future__ import annotations
 
@@ -76,13 +76,7 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         paused_at=row.paused_at,
         engine_digest=row.engine_digest,
         request=row.request,
-        links={
-            "self": f"/v1/grids/{row.id}",
-            "runs": f"/v1/grids/{row.id}/runs",
-            "summary": f"/v1/grids/{row.id}/summary",
-            "events": f"/v1/grids/{row.id}/events",
-            **{action: f"/v1/grids/{row.id}/{action}" for action in ("cancel", "pause", "resume", "retry")},
-        },
+        links={},
     )
 
 
@@ -114,15 +108,11 @@ def run_document(
 
     A result has four hundred numbers; to check each of them again takes longer than to read them.
     """
-    fields = _run_fields(row)
-    result = None if found is None else _result(found, estimates)
-    if result is not None and result["figure"] is not None:
-        fields["links"]["figure"] = f"/v1/runs/{row.id}/figure"
     return {
-        **fields,
+        **_run_fields(row),
         "spec": row.spec,
         "digest": row.digest,
-        "result": result,
+        "result": None if found is None else _result(found, estimates),
         "attempts": [dict(zip(_ATTEMPT, ended, strict=True)) for ended in attempts],
     }
 
@@ -184,5 +174,5 @@ def _run_fields(row: Row[Any]) -> dict[str, Any]:
         "state": state,
         "uws_phase": UWS_PHASES[state],
         "error": error,
-        "links": {"self": f"/v1/runs/{row.id}", "grid": f"/v1/grids/{row.grid_id}"},
+        "links": {},
     }

@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 from sqlalchemy import Connection, Select, delete, func, insert, select, true, update
 
 from service.domain.identifiers import new_grid_id, run_id
+from service.domain.plan import Plan, PlannedRun
 from service.domain.states import GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.database import Database
@@ -27,28 +28,6 @@ from service.store.tables import grid, idempotency, run
 
 class SubmissionLostError(RuntimeError):
     """Of a grid nothing had been stored for so long that it was given up; the request may be repeated."""
-
-
-@dataclass(frozen=True)
-class PlannedRun:
-    """One run of a grid that is about to be stored."""
-
-    label: str
-    paper_run: int | None
-    spec: dict[str, Any]
-    inputs: dict[str, Any]
-    digest: str
-    kind: str = "realization"
-
-
-class Plan(Protocol):
-    """Runs whose number is known, made as they are asked for, the same each time."""
-
-    def __len__(self) -> int:
-        """How many there are."""
-
-    def __iter__(self) -> Iterator[PlannedRun]:
-        """Begin with the first."""
 
 
 @dataclass(frozen=True)

@@ -45,12 +45,12 @@ class Greeting(BaseModel):
     pause_fraction: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] | None = None
 
 
-class Answers(BaseModel):
-    """What a worker says after the runs of one task: an answer each, and the memory of its process by then [bytes]."""
+class Answer(BaseModel):
+    """What a worker says after a run: its answer, and the memory of the worker's process by then [bytes]."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    answers: list[dict[str, Any]]
+    answer: dict[str, Any]
     memory: Annotated[int, Field(ge=0)] = 0
 
 
@@ -64,12 +64,9 @@ def read_greeting(said: object) -> Greeting:
     return _read(Greeting, said, _GREETING_BYTES)
 
 
-def read_answers(said: object, runs: int) -> Answers:
-    """A worker's answers for so many runs; NotPlainError where they are none."""
-    found = _read(Answers, said, (runs + 1) * LIMIT_BYTES)
-    if len(found.answers) != runs:
-        raise NotPlainError("the worker did not answer for every run that it was given")
-    return found
+def read_answer(said: object) -> Answer:
+    """A worker's answer for a run; NotPlainError where it is none."""
+    return _read(Answer, said, 2 * LIMIT_BYTES)
 
 
 def _read(kind: type[_DocumentT], said: object, limit: int) -> _DocumentT:

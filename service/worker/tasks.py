@@ -5,7 +5,6 @@ A worker sees no database. It answers with bytes of JSON only, errors included: 
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import logging
 import os
@@ -13,7 +12,6 @@ import sys
 import time
 import traceback
 from base64 import b64encode
-from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -35,24 +33,19 @@ _FIRST_COLD = "parametric"
 """Stage of the engine before which a warm-up ends: nearly all that is slow the first time is in the one before."""
 
 
-def call_tasks(
-    task: str, specs: Sequence[dict[str, Any]], artefact_url: str, fields: Sequence[logs.Fields] = ()
-) -> bytes:
-    """Run the task for one specification after the other; :class:`service.worker.answers.Answers`, in the same order.
+def answer_run(task: str, spec: dict[str, Any], artefact_url: str, fields: logs.Fields | None = None) -> bytes:
+    """Run the task for a specification; :class:`service.worker.answers.Answer`.
 
-    The dispatcher submits this function, so that it need not import the engine itself. Short runs come several at a
-    time: what Dask does for each task would take longer than they do. ``fields``, if given, has for each specification
-    what goes on every line that is logged meanwhile.
+    The dispatcher submits this function, so that it need not import the engine itself. ``fields`` go on every line
+    that is logged meanwhile.
     """
-    answers = []
     _running.append(None)
     try:
-        for place, spec in enumerate(specs):
-            with logs.bound(**(fields[place] if fields else {})):
-                answers.append(_plain(call_task(task, spec, artefact_url)))
+        with logs.bound(**(fields or {})):
+            answer = _plain(call_task(task, spec, artefact_url))
     finally:
         _running.pop()
-    return b'{"answers":[%b],"memory":%d}' % (b",".join(answers), _memory())
+    return b'{"answer":%b,"memory":%d}' % (answer, _memory())
 
 
 def _plain(answer: dict[str, Any]) -> bytes:
@@ -200,11 +193,9 @@ def _products(result: RunResult, artefacts: ArtefactStore) -> ArtefactPayload | 
         return None
     import numpy
 
-    values = {field.name: getattr(result.products, field.name) for field in dataclasses.fields(result.products)}
-    arrays = {name: numpy.asarray(value) for name, value in values.items() if value is not None}
     data = io.BytesIO()
     # Objects would be pickled, and nobody should have to unpickle a file to read it.
-    plain: dict[str, Any] = {name: array for name, array in arrays.items() if array.dtype != object}
+    plain: dict[str, Any] = {n: array for n, array in result.products.arrays().items() if array.dtype != object}
     numpy.savez_compressed(data, **plain)
     return artefacts.put(data.getvalue(), "npz")
 

@@ -26,11 +26,11 @@ from tests.drills.kills import DispatcherKills, SchedulerKills, WorkerKills
 from tests.drills.outages import DiskFull, PostgresKills, SqliteLock
 from tests.drills.remote import TwoWorkers
 from tests.drills.rivals import Poison, StoppedWorker, TwoDispatchers
-from tests.drills.scale import Overhead, Throughput
+from tests.drills.scale import Breadth, Overhead, Throughput
 from tests.drills.stores import StoreAway
 from tests.drills.users import Cancel, Idempotency
 from tests.drills.volume import Listing, Submission
-from tests.drills.workers import Lifetime, SilentWorker
+from tests.drills.workers import SilentWorker
 
 DRILLS: dict[str, type[Drill]] = {
     drill.name: drill
@@ -44,12 +44,12 @@ DRILLS: dict[str, type[Drill]] = {
         StoreAway,
         StoppedWorker,
         SilentWorker,
-        Lifetime,
         TwoDispatchers,
         Poison,
         Cancel,
         Idempotency,
         Throughput,
+        Breadth,
         Submission,
         Listing,
         Overhead,

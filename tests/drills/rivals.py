@@ -149,7 +149,6 @@ class Poison(Drill):
 
     runs: int = 120
     sleep_s: float = 0.2
-    batch: int = 1
 
     def run(self, ground: Ground) -> Report:
         """One run in forty is poison, by its seed."""
@@ -157,7 +156,6 @@ class Poison(Drill):
             "HOSTLENS_TASK": "tests.drills.tasks:poisonous",
             "HOSTLENS_DRILL_SLEEP": str(self.sleep_s),
             "HOSTLENS_RETRY_DELAY_S": "0.2",
-            "HOSTLENS_BATCH": str(self.batch),
         }
         guilty = {place for place in range(self.runs) if place % POISON_EVERY == 1}
         with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
@@ -176,7 +174,7 @@ class Poison(Drill):
         return Report(
             self.name,
             f"{self.runs} runs of {self.sleep_s:g} s, {len(guilty)} of them poison, two local workers, "
-            f"{self.batch} at a time, {ground.backend}",
+            f"{ground.backend}",
             (
                 Figure("quarantined", len(quarantined)),
                 Figure("done", found.states.get("done", 0)),

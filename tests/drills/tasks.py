@@ -1,102 +1,24 @@
-"""What a worker runs in a drill instead of the engine: valid synthetic results, fast, slow, hungry or deadly.
-
-``HOSTLENS_TASK=tests.drills.tasks:brief`` selects one. The variables that they look at:
-
-``HOSTLENS_DRILL_SLEEP``  seconds that a run takes (0.2)
-``HOSTLENS_DRILL_LOG``    a file that gets a line for each execution that came to its end
-"""
+"""What a worker runs in a drill beside :func:`service.worker.synthetic.brief`: fast, slow, hungry or deadly."""
 
 from __future__ import annotations
 
-import hashlib
 import os
 import random
 import time
 from typing import Any
 
-from engine import Realization, realization_from_dict
-from service.domain.payload import ESTIMATES
+from engine import realization_from_dict
 from service.store.artefacts import ArtefactStore
+from service.worker.synthetic import PNG, brief, log_execution, payload_of, seconds, synthetic_payload
 
-# A PNG of one pixel.
-PNG = bytes.fromhex(
-    "89504e470d0a1a0a0000000d4948445200000001000000010802000000907753de"
-    "0000000c49444154789c63f8cfc0000003010100c9fe92ef0000000049454e44ae426082"
-)
+__all__ = ["PNG", "brief", "payload_of", "synthetic_payload"]
 POISON_EVERY = 40
 """Of the runs of :func:`poisonous`, those with seed 1 modulo this kill their worker."""
-
-
-def synthetic_payload(spec: dict[str, Any]) -> dict[str, Any]:
-    """What a run could have found: near the truth, and always the same for the same spec."""
-    return payload_of(realization_from_dict(spec))
-
-
-def payload_of(realization: Realization) -> dict[str, Any]:
-    """The same from a realization that has been read already."""
-    digest = realization.digest
-    dice = random.Random(digest)
-    host = realization.host
-
-    def quantity(truth: float, sd: float) -> dict[str, float]:
-        return {"mean": truth + dice.gauss(0.0, sd), "sd": sd, "truth": truth}
-
-    def estimate() -> dict[str, Any]:
-        return {
-            "magnitude": quantity(host.magnitude, 0.1),
-            "r_eff": quantity(host.r_eff, 0.03),
-            "r_eff_galfit": quantity(host.r_eff / (host.q or 0.8) ** 0.5, 0.04),
-            "n": quantity(host.n, 0.3),
-            "q": quantity(host.q or 0.8, 0.05),
-            "position_angle": quantity(host.position_angle or 30.0, 4.0),
-            "x": quantity(0.01, 0.001),
-            "y": quantity(-0.02, 0.001),
-            "draws": 30,
-            "at_bound": 3,
-            "n_at_bound": 2,
-            "r_eff_at_bound": 1,
-            "failed": 0,
-        }
-
-    return {
-        "realization_digest": digest,
-        "engine_digest": hashlib.sha256(b"no engine").hexdigest(),
-        "versions": {"tasks": "1"},
-        "noise_treatment": realization.analysis.noise_treatment,
-        "regularisation": realization.analysis.regularisation,
-        "estimates": {name: estimate() for name in ESTIMATES},
-        "aperture": {
-            "radius": 1.0, "magnitude": quantity(host.magnitude + 0.1, 0.05), "coverage": 0.9, "draws": 30, "failed": 0,
-        },
-        "lens": {"theta_E": quantity(1.2, 0.01), "slope": quantity(2.0, 0.05), "ln_lambda": {"mean": 2.0, "sd": 0.3}},
-        "chain": {
-            "status": "converged", "walkers": 24, "steps": 400, "burn_in": 100,
-            "tau": 31.5, "effective_samples": 228.0, "acceptance": 0.41, "evaluations": 9600,
-            "r_hat": 1.004,
-        },
-        "ln_evidence": -5123.25,
-        "chi2": 4980.0,
-        "degrees_of_freedom": 5100,
-        "condition_number": 1e6,
-        "arc_magnitude": 18.4,
-        "agn_contrast": -1.5,
-        "surface_brightness": 21.0,
-        "stages": [{"stage": "sleep", "wall_s": 0.05, "cpu_s": 0.001}],
-    }  # fmt: skip
 
 
 def nothing(spec: dict[str, Any], _artefact_url: str) -> dict[str, Any]:
     """No work at all: what remains is the queue."""
     return synthetic_payload(spec)
-
-
-def brief(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
-    """A run that sleeps, leaves a figure, and a line in the log for each execution."""
-    payload = synthetic_payload(spec)
-    time.sleep(_seconds())
-    _log_execution(payload["realization_digest"])
-    payload["figure"] = ArtefactStore(artefact_url).put(PNG, "png").model_dump()
-    return payload
 
 
 def pictured(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
@@ -109,20 +31,26 @@ def pictured(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     return payload
 
 
+def uneven(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
+    """Like brief, and then for up to twice as long again, by the seed: runs that begin together do not end so."""
+    time.sleep(seconds() * 2.0 * random.Random(spec["seed"]).random())
+    return brief(spec, artefact_url)
+
+
 def busy(spec: dict[str, Any], _artefact_url: str) -> dict[str, Any]:
     """A run that computes: as much of a core as brief sleeps, counted in CPU time, whatever else runs beside it."""
     payload = synthetic_payload(spec)
-    until = time.thread_time() + _seconds()
+    until = time.thread_time() + seconds()
     while time.thread_time() < until:
         sum(range(10_000))
-    _log_execution(payload["realization_digest"])
+    log_execution(payload["realization_digest"])
     return payload
 
 
 def poisonous(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     """Like brief, but one seed in forty kills its worker on every attempt, a moment after the run has begun."""
     if spec["seed"] % POISON_EVERY == 1:
-        time.sleep(_seconds() / 2)
+        time.sleep(seconds() / 2)
         os._exit(9)
     return brief(spec, artefact_url)
 
@@ -140,14 +68,3 @@ def moody(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     if seed == 2:
         payload["estimates"]["paper_free"]["n"]["mean"] = float("nan")
     return payload
-
-
-def _seconds() -> float:
-    return float(os.environ.get("HOSTLENS_DRILL_SLEEP", "0.2"))
-
-
-def _log_execution(digest: str) -> None:
-    log = os.environ.get("HOSTLENS_DRILL_LOG")
-    if log is not None:
-        with open(log, "a", encoding="utf-8") as file:
-            file.write(f"{digest} {os.getpid()}\n")

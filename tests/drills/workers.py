@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -69,52 +68,3 @@ class SilentWorker(Drill):
     def _bound(self) -> float:
         """The scheduler looks once in each time to live, and the nanny waits for an answer before it kills."""
         return 4 * self.ttl_s + self.runs * self.sleep_s
-
-
-@dataclass(frozen=True)
-class Lifetime(Drill):
-    """Workers that are started anew at a certain age."""
-
-    name: ClassVar[str] = "lifetime"
-    what: ClassVar[str] = "workers that are started anew after 4 s, in a grid of 120 runs of 0.3 s"
-    claim: ClassVar[str] = "several restarts, at runs' ends: every run executed once and stored once, nobody charged"
-    small: ClassVar[dict[str, object]] = {"runs": 40, "lifetime_s": 2.0}
-
-    runs: int = 120
-    lifetime_s: float = 4.0
-    sleep_s: float = 0.3
-
-    def run(self, ground: Ground) -> Report:
-        """Let a grid go through several generations of workers."""
-        calm = undisturbed(self.runs)
-        pids: set[int] = set()
-        settings = {"HOSTLENS_DRILL_SLEEP": str(self.sleep_s), "HOSTLENS_WORKER_LIFETIME_S": str(self.lifetime_s)}
-        with installation(ground.folder / "drill", {**settings, **ground.settings}) as service:
-            began = time.monotonic()
-            grid = service.client.submit(body(self.runs))
-
-            def seen(_view: object) -> None:
-                with suppress(psutil.Error):
-                    pids.update(worker.pid for worker in service.workers())
-
-            service.watch(grid.id, seen)
-            took = time.monotonic() - began
-            found, executed = records(service, grid.id), service.executed()
-        return Report(
-            self.name,
-            f"{self.runs} runs of {self.sleep_s:g} s, two local workers, lifetime {self.lifetime_s:g} s, "
-            f"{ground.backend}",
-            (
-                Figure("worker processes", len(pids)),
-                Figure("stored", found.stored),
-                Figure("executions", len(executed)),
-                Figure("wall time", took, "s"),
-            ),
-            (
-                stored_once(found, self.runs),
-                identical(found, calm),
-                Claim("workers were started anew", len(pids) >= 4),
-                Claim("every run was executed once", len(executed) == len(set(executed)) == self.runs),
-                Claim("nobody was charged or sent back", dict(found.outcomes) == {"done": self.runs}),
-            ),
-        )

@@ -31,7 +31,6 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         sigma=np.full(shape, np.inf),
         chi2=0.0,
         degrees_of_freedom=1,
-        evaluations=0,
     )
 
 

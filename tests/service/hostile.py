@@ -14,7 +14,7 @@ from service.worker import tasks
 from tests.service.tasks import fast
 
 _FOLDER = "HOSTLENS_DRILL_HARM"
-MODES = ("well", "payload", "raw", "exception", "huge", "deep", "not_json", "events", "too_few", "exit")
+MODES = ("well", "payload", "raw", "exception", "huge", "deep", "not_json", "events", "nothing", "exit")
 
 
 def harm() -> str:
@@ -40,21 +40,21 @@ _ANSWERS = {
     "huge": b" " * (3 * 2**20),
     "deep": b"[" * 200_000,
     "not_json": b"\x80\x04.",
-    "too_few": b'{"answers":[],"memory":1}',
+    "nothing": b'{"memory":1}',
 }
-_well = tasks.call_tasks
+_well = tasks.answer_run
 _greet_well = tasks.to_bytes
 
 
-def _call_tasks(task: str, specs: list[dict[str, Any]], *arguments: Any) -> Any:
-    mode = MODES[specs[0]["seed"]]
+def _answer_run(task: str, spec: dict[str, Any], *arguments: Any) -> Any:
+    mode = MODES[spec["seed"]]
     if mode == "exception":
         raise HarmfulError("text that is in it")
-    return _ANSWERS[mode] if mode in _ANSWERS else _well(task, specs, *arguments)
+    return _ANSWERS[mode] if mode in _ANSWERS else _well(task, spec, *arguments)
 
 
 if _FOLDER in os.environ:  # in a worker, not where the tests themselves import this
-    tasks.call_tasks = _call_tasks
+    tasks.answer_run = _answer_run
 
 
 def answer(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 from service.domain.payload import ResultPayload, read_payload
+from service.domain.plan import PlannedRun
 from service.domain.requests import GridRequest, plan
 from service.store.grids import GridStore
 from service.store.leases import Lease
-from service.store.submission import PlannedRun
 from tests.service.tasks import synthetic_payload
 
 BODY = {"preset": "h0licow-vi/HE0435", "n": [2], "magnitude": [20.5], "l_eta": [1.0], "r_eff": [0.39]}

@@ -23,7 +23,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from service.api.app import create_app
 from service.dispatcher import backlog
-from service.dispatcher.backlog import Holding, NoRoomError
+from service.dispatcher.backlog import Backlog, NoRoomError
 from service.dispatcher.outcomes import read_artefacts
 from service.dispatcher.telemetry import DispatcherMetrics
 from service.domain.payload import ArtefactPayload, InvalidResultError, ResultPayload, read_payload
@@ -265,7 +265,7 @@ def test_one_artefact_that_says_nothing_is_refused_and_the_store_is_not_away(
 ) -> None:
     monkeypatch.setattr(backlog, "_FIRST_BACK_OFF_S", 0.0)
     store = ArtefactStore(str(tmp_path / "store"), patience_s=0.1)
-    holding = Holding(store, tmp_path, DispatcherMetrics())
+    holding = Backlog(store, tmp_path, DispatcherMetrics())
     held = [held_result(number) for number in range(3)]
     with silent(*[Path(store.path(key)) for key in held[1][1]]):
         for number, (payload, artefacts) in enumerate(held):
@@ -325,7 +325,7 @@ def test_a_worker_sends_home_what_the_store_does_not_take(tmp_path: Path) -> Non
     with away(tmp_path / "store"):
         answer = call_task("tests.drills.tasks:pictured", SPEC, str(tmp_path / "store"))
     payload = read_payload(answer["payload"])
-    artefacts = read_artefacts(payload, [answer], 0)
+    artefacts = read_artefacts(payload, answer)
     assert payload.figure is not None
     assert payload.products is not None
     assert artefacts.keys() == {payload.figure.key, payload.products.key}
@@ -346,7 +346,7 @@ def test_artefacts_that_are_not_the_payload_s_are_an_invalid_result(brought: Any
     if isinstance(brought, dict) and "figure" in brought:
         brought = {figure.key: brought["figure"]}
     with pytest.raises(InvalidResultError, match="artefacts"):
-        read_artefacts(payload, [{"artefacts": brought}], 0)
+        read_artefacts(payload, {"artefacts": brought})
 
 
 @pytest.mark.parametrize("key", ["../etc/passwd", "ab/" + "0" * 64 + ".png", "x"])
@@ -380,10 +380,11 @@ def test_while_the_store_is_away_results_wait_nothing_is_claimed_and_nobody_is_c
 ) -> None:
     setting = setting_of(database, tmp_path)
     with away(setting.pool.folder):
-        setting.dispatcher._holding._next = time.monotonic() + 60  # it has just been asked, and was there
+        setting.dispatcher._backlog._next = time.monotonic() + 60  # it has just been asked, and was there
         setting.run(steps=30)
         counts = setting.grids.grid(setting.grid_id).counts
-        assert (counts.done, counts.leased, len(setting.pool.submitted)) == (0, 2, 2)
+        # The first two, and the two that their workers were given before it was seen what these had brought home.
+        assert (counts.done, counts.leased, len(setting.pool.submitted)) == (0, 4, 4)
         assert setting.heartbeat.artefacts_away
     setting.run(until=lambda: setting.grids.grid(setting.grid_id).finished_at is not None, steps=5000)
     assert outcomes(setting) == [["done"]] * 6
@@ -402,8 +403,8 @@ def test_while_the_store_is_away_results_wait_nothing_is_claimed_and_nobody_is_c
 def test_artefacts_of_megabytes_come_home_too(database: Database, tmp_path: Path) -> None:
     setting = setting_of(database, tmp_path, runs=2, kind=Heavy)
     with away(setting.pool.folder):
-        setting.dispatcher._holding._next = time.monotonic() + 60
-        setting.run(until=lambda: len(setting.dispatcher._holding.leases) == 2, steps=200)
+        setting.dispatcher._backlog._next = time.monotonic() + 60
+        setting.run(until=lambda: len(setting.dispatcher._backlog.leases) == 2, steps=200)
     setting.run(steps=5000)
     assert outcomes(setting) == [["done"]] * 2
 
@@ -449,15 +450,15 @@ def test_held_results_of_a_cancelled_grid_are_dropped_and_those_of_a_stopped_dis
 ) -> None:
     setting = setting_of(database, tmp_path)
     with away(setting.pool.folder):
-        setting.dispatcher._holding._next = time.monotonic() + 60
+        setting.dispatcher._backlog._next = time.monotonic() + 60
         setting.run(steps=10)
         setting.dispatcher.hand_back()
         assert setting.grids.grid(setting.grid_id).counts.queued == 6
-        assert setting.dispatcher._holding.leases == []
+        assert setting.dispatcher._backlog.leases == []
     setting.run(until=lambda: len(setting.pool.submitted) >= 4, steps=2000)
     with away(setting.pool.folder):
-        setting.dispatcher._holding._next = time.monotonic() + 60
-        setting.run(until=lambda: bool(setting.dispatcher._holding.leases), steps=2000)
+        setting.dispatcher._backlog._next = time.monotonic() + 60
+        setting.run(until=lambda: bool(setting.dispatcher._backlog.leases), steps=2000)
         setting.grids.cancel(setting.grid_id)
         setting.dispatcher._due.clear()
         setting.run(steps=500)
@@ -483,7 +484,7 @@ def test_more_than_memory_should_keep_waits_in_a_file_without_a_name_and_beyond_
     monkeypatch.setattr(backlog, "_ON_DISK", 4500)
     monkeypatch.setattr(backlog, "_LEFT_FREE", 0)
     folder = tmp_path / "store"
-    holding = Holding(ArtefactStore(str(folder)), tmp_path / "scratch", DispatcherMetrics())
+    holding = Backlog(ArtefactStore(str(folder)), tmp_path / "scratch", DispatcherMetrics())
     for turn in range(3):  # the room is there again once it is empty
         with away(folder):
             assert holding.attend() == []
@@ -501,7 +502,7 @@ def test_more_than_memory_should_keep_waits_in_a_file_without_a_name_and_beyond_
 
 def test_a_full_store_is_waited_for_even_where_it_takes_small_things(small_disk: Path, tmp_path: Path) -> None:
     (small_disk / "filler").write_bytes(bytes(50_000))
-    holding = Holding(ArtefactStore(str(small_disk / "store")), tmp_path, DispatcherMetrics())
+    holding = Backlog(ArtefactStore(str(small_disk / "store")), tmp_path, DispatcherMetrics())
     data = bytes(20_000)
     figure = ArtefactStore("memory://held").put(data, "png")
     holding.add(lease(1), read_payload(synthetic_payload(SPEC) | {"figure": figure.model_dump()}), {figure.key: data})

@@ -80,6 +80,7 @@ WRONG = {
     "an empty body": ("submit", "--file", "empty.json"),
     "a folder as body": ("submit", "--file", "."),
     "no such body": ("submit", "--file", "nowhere.json"),
+    "a pipe as body": ("submit", "--file", "pipe"),
     "NaN as an option": ("submit", "--n", "nan"),
     "infinity as an option": ("submit", "--magnitude", "inf"),
     "a key beyond ASCII": ("submit", "--preset", "h0licow-vi", "--key", "clé"),
@@ -168,6 +169,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name, data in FILES.items():
         (tmp_path / name).write_bytes(data)
     (tmp_path / "folder.toml").mkdir()
+    os.mkfifo(tmp_path / "pipe")
     monkeypatch.chdir(tmp_path)
     for name in [name for name in os.environ if name.startswith("HOSTLENS_")]:
         monkeypatch.delenv(name)

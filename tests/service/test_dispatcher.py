@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from threading import Event
@@ -13,6 +12,7 @@ from typing import Any
 
 import pytest
 from distributed import KilledWorker
+from distributed.client import ClosedClientError
 from sqlalchemy.exc import DataError, InternalError, OperationalError, StatementError
 
 from engine import engine_digest
@@ -29,7 +29,7 @@ from service.store.grids import GridStore
 from service.store.leadership import Leadership, LeadershipLostError
 from service.store.leases import Lease
 from service.store.queue import RunQueue, Stored
-from service.worker.tasks import call_tasks
+from service.worker.tasks import answer_run
 from tests.service.plans import body, planned
 from tests.service.service_process import eventually
 
@@ -37,11 +37,11 @@ from tests.service.service_process import eventually
 class Answered:
     """A Dask future that has its answer already, or never gets one."""
 
-    def __init__(self, leases: Sequence[Lease], status: str, task: str = "tests.service.tasks:fast") -> None:
+    def __init__(self, lease: Lease, status: str, task: str = "tests.service.tasks:fast") -> None:
         self._task = task
-        self.key = leases[0].key
+        self.key = lease.key
         self.status = status
-        self._specs = [lease.spec for lease in leases]
+        self._spec = lease.spec
         self._answers: Any = None
         self._told: Callable[[Any], None] = lambda _: None
 
@@ -52,7 +52,7 @@ class Answered:
 
     def answer(self, folder: Path) -> None:
         """It has run."""
-        self._answers = call_tasks(self._task, self._specs, str(folder))
+        self._answers = answer_run(self._task, self._spec, str(folder))
         self.status = "finished"
 
     def kill(self) -> None:
@@ -93,7 +93,6 @@ class InstantPool:
         self.engine = engine_digest()
         self.stopped: list[Any] = []
         self.submitted: list[str] = []
-        self.batches: list[int] = []
         self.placed: list[tuple[str, Lease]] = []
         self.futures: list[Answered] = []
 
@@ -103,11 +102,10 @@ class InstantPool:
     def present(self) -> list[str]:
         return self.addresses
 
-    def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
-        self.submitted += [lease.run_id for lease in leases]
-        self.placed += [(worker.address, lease) for lease in leases]
-        self.batches.append(len(leases))
-        future = Answered(leases, self.statuses.pop(0) if self.statuses else "finished", self.task)
+    def submit(self, lease: Lease, worker: Worker) -> Answered:
+        self.submitted.append(lease.run_id)
+        self.placed.append((worker.address, lease))
+        future = Answered(lease, self.statuses.pop(0) if self.statuses else "finished", self.task)
         if future.status == "finished":
             future.answer(self.folder)
         self.futures.append(future)
@@ -197,7 +195,19 @@ def test_a_result_is_kept_while_the_database_is_away_and_nothing_is_claimed_mean
     setting.run()
     assert setting.grids.grid(setting.grid_id).state is GridState.DONE
     assert len(setting.pool.submitted) == len(set(setting.pool.submitted)) == 6
-    assert setting.queue.events[:6] == ["claim", "away", "away", "away", "store", "claim"]
+    assert setting.queue.events[:7] == ["claim", "claim", "away", "away", "away", "store", "claim"]
+
+
+def test_a_dispatcher_outlives_the_moment_in_which_dasks_client_closes_itself(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closed(_: Answered) -> None:
+        raise ClosedClientError("Client is closed. Can't send cancel-keys message.")
+
+    monkeypatch.setattr(Answered, "cancel", closed)
+    setting = Setting(database, InstantPool(tmp_path, "lost", "cancelled"), runs=3, reconcile_s=0.02)
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 3
 
 
 def test_a_run_that_dask_has_lost_is_run_again_uncharged(database: Database, tmp_path: Path) -> None:
@@ -240,18 +250,6 @@ def test_workers_that_are_away_for_a_moment_keep_their_runs_and_ones_that_stay_a
     assert setting.grids.grid(setting.grid_id).counts.done == 2
 
 
-def test_what_was_claimed_ahead_waits_while_all_workers_are_started_anew(database: Database, tmp_path: Path) -> None:
-    pool = InstantPool(tmp_path, "pending", "pending")
-    setting = Setting(database, pool, runs=6, reconcile_s=0.001)
-    setting.dispatcher._brief.add(setting.pool.engine)
-    setting.run(until=lambda: setting.grids.grid(setting.grid_id).counts.leased == 4)
-    pool.addresses = []
-    setting.run(steps=2)
-    assert setting.grids.grid(setting.grid_id).counts.leased == 4
-    setting.run(steps=4)
-    assert setting.grids.grid(setting.grid_id).counts.queued == 6, "without workers for long it is given back"
-
-
 def outcomes(setting: Setting) -> list[list[str]]:
     runs = setting.grids.runs(setting.grid_id, 100).items
     return [[end.outcome for end in setting.grids.run(run.id).attempts] for run in runs]
@@ -263,7 +261,7 @@ def test_a_run_alone_on_a_worker_that_died_is_charged_and_tried_again_alone(data
     setting.run()
     assert setting.grids.grid(setting.grid_id).counts.done == 4
     assert outcomes(setting) == [["worker_lost", "done"], ["done"], ["done"], ["done"]]
-    assert [lease.suspect for _, lease in pool.placed] == [False] * 4 + [True]
+    assert [lease.attempt for _, lease in pool.placed if lease.suspect] == [2]
 
 
 def test_runs_that_shared_a_dead_worker_are_charged_nothing_and_run_one_at_a_time_alone(
@@ -295,8 +293,8 @@ def test_a_run_that_had_ended_on_a_worker_that_the_next_one_killed_is_not_suspec
     class Unreachable(InstantPool):
         """The answer of the first run never comes: its worker is at the second, which kills it."""
 
-        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
-            future = super().submit(leases, worker)
+        def submit(self, lease: Lease, worker: Worker) -> Answered:
+            future = super().submit(lease, worker)
             if len(self.futures) == 1:
                 future.result = self._no_answer  # type: ignore[method-assign]
             return future
@@ -309,7 +307,6 @@ def test_a_run_that_had_ended_on_a_worker_that_the_next_one_killed_is_not_suspec
     pool = Unreachable(tmp_path, "pending", "pending")
     pool.addresses = ["a"]
     setting = Setting(database, pool, runs=2)
-    setting.dispatcher._brief.add(setting.pool.engine)
     setting.run(until=lambda: len(pool.submitted) == 1)
     pool.futures[0].finish(tmp_path)
     setting.run(steps=2000)
@@ -328,9 +325,9 @@ def test_a_run_that_kills_three_workers_is_quarantined_and_no_other_is_charged(
     database: Database, tmp_path: Path
 ) -> None:
     class Poisoned(InstantPool):
-        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
-            self.statuses = ["error" if leases[0].run_id.endswith("1") else "finished"]
-            return super().submit(leases, worker)
+        def submit(self, lease: Lease, worker: Worker) -> Answered:
+            self.statuses = ["error" if lease.run_id.endswith("1") else "finished"]
+            return super().submit(lease, worker)
 
     setting = Setting(database, Poisoned(tmp_path), runs=5)
     setting.run(steps=2000)
@@ -339,66 +336,19 @@ def test_a_run_that_kills_three_workers_is_quarantined_and_no_other_is_charged(
     assert outcomes(setting) == [["done"], ["worker_lost"] * 3, ["done"], ["done"], ["done"]]
 
 
-def test_short_runs_go_several_at_a_time_and_a_death_among_them_charges_only_the_one_that_dies_alone(
-    database: Database, tmp_path: Path
-) -> None:
-    class Poisoned(InstantPool):
-        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
-            self.statuses = ["error" if any(lease.run_id.endswith("1") for lease in leases) else "finished"]
-            return super().submit(leases, worker)
-
-    pool = Poisoned(tmp_path)
-    setting = Setting(database, pool, runs=10, batch=4)
-    setting.run(steps=5000)
-    assert pool.batches[:4] == [4, 4, 1, 1]
-    counts = setting.grids.grid(setting.grid_id).counts
-    assert (counts.done, counts.quarantined) == (9, 1)
-    ended = Counter(end for ends in outcomes(setting) for end in ends)
-    assert ended == {"done": 9, "suspected": 4, "worker_lost": 3}
-
-
-def test_the_next_short_run_is_given_to_its_worker_before_the_last_one_is_stored(
+def test_the_next_run_is_given_to_a_worker_before_the_last_one_s_answer_is_stored(
     database: Database, tmp_path: Path
 ) -> None:
     class Noted(InstantPool):
-        def submit(self, leases: Sequence[Lease], worker: Worker) -> Answered:
+        def submit(self, lease: Lease, worker: Worker) -> Answered:
             setting.queue.events.append("submit")
-            return super().submit(leases, worker)
+            return super().submit(lease, worker)
 
     setting = Setting(database, Noted(tmp_path), runs=6)
     setting.run()
-    first, then = ["claim", *["submit"] * 2, "store"], ["claim", *["submit"] * 4, "store"]
-    assert setting.queue.events == first + then
+    round_ = ["claim", *["submit"] * 2]
+    assert setting.queue.events == [*round_, *round_, "store", *round_, "store", "store"]
     assert setting.grids.grid(setting.grid_id).counts.done == 6
-
-
-@pytest.fixture
-def ahead(database: Database, tmp_path: Path) -> Setting:
-    """Two runs on workers, and two that were claimed for when these are done."""
-    pool = InstantPool(tmp_path, *["pending"] * 2)
-    setting = Setting(database, pool, runs=6, engine=engine_digest(), reconcile_s=0.02)
-    setting.dispatcher._brief.add(setting.pool.engine)
-    setting.run(until=lambda: len(setting.pool.submitted) == 2)
-    assert (setting.grids.grid(setting.grid_id).counts.leased, len(setting.pool.submitted)) == (4, 2)
-    return setting
-
-
-def test_runs_claimed_ahead_are_cancelled_with_their_grid(ahead: Setting) -> None:
-    ahead.grids.cancel(ahead.grid_id)
-    ahead.run()
-    assert ahead.grids.grid(ahead.grid_id).counts.cancelled == 6
-    assert len(ahead.pool.submitted) == 2
-
-
-def test_runs_claimed_ahead_are_not_started_once_their_grid_is_paused(ahead: Setting, tmp_path: Path) -> None:
-    ahead.grids.pause(ahead.grid_id)
-    ahead.dispatcher._due.clear()
-    ahead.run(until=lambda: ahead.grids.grid(ahead.grid_id).counts.paused == 4)
-    for future in ahead.pool.futures:
-        future.finish(tmp_path)
-    ahead.run(steps=20)
-    counts = ahead.grids.grid(ahead.grid_id).counts
-    assert (counts.done, counts.paused, len(ahead.pool.submitted)) == (2, 4, 2)
 
 
 def test_the_worker_of_each_cancelled_run_is_stopped_though_the_database_goes_away_in_between(
@@ -426,30 +376,6 @@ def test_the_worker_of_each_cancelled_run_is_stopped_though_the_database_goes_aw
     assert len(pool.stopped) == 2
 
 
-def test_a_stop_hands_back_what_was_claimed_ahead_and_starts_nothing_more(ahead: Setting, tmp_path: Path) -> None:
-    for future in ahead.pool.futures:
-        future.finish(tmp_path)
-    ahead.dispatcher.drain()
-    ahead.dispatcher.hand_back()
-    counts = ahead.grids.grid(ahead.grid_id).counts
-    assert (counts.done, counts.queued, len(ahead.pool.submitted)) == (2, 4, 2)
-
-
-def test_runs_claimed_ahead_go_back_where_no_worker_carries_their_engine_any_more(ahead: Setting) -> None:
-    ahead.pool.engine = "e" * 64
-    ahead.run(until=lambda: ahead.grids.grid(ahead.grid_id).counts.leased == 2)
-    assert sorted(outcomes(ahead)) == [[], [], [], [], ["forgotten"], ["forgotten"]]
-
-
-def test_a_dead_worker_charges_no_run_that_was_claimed_ahead(ahead: Setting, tmp_path: Path) -> None:
-    ahead.pool.futures[0].kill()
-    ahead.run(until=lambda: len(ahead.pool.submitted) > 2)
-    for future in ahead.pool.futures:
-        future.finish(tmp_path)
-    ahead.run(steps=2000)
-    assert sorted(outcomes(ahead)) == [["done"]] * 5 + [["worker_lost", "done"]]
-
-
 def test_one_result_that_the_database_refuses_keeps_no_other_out(database: Database, tmp_path: Path) -> None:
     class Fussy(ShakyQueue):
         def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
@@ -457,7 +383,7 @@ def test_one_result_that_the_database_refuses_keeps_no_other_out(database: Datab
                 raise DataError("INSERT", {}, Exception("numeric value out of range"))
             return super().store_all(results)
 
-    setting = Setting(database, InstantPool(tmp_path), runs=8, batch=4)
+    setting = Setting(database, InstantPool(tmp_path), runs=8)
     setting.queue.__class__ = Fussy
     setting.run()
     counts = setting.grids.grid(setting.grid_id).counts

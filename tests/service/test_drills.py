@@ -22,7 +22,6 @@ from tests.drills.report import Report, quantile
 from tests.drills.rivals import Poison, StoppedWorker, TwoDispatchers
 from tests.drills.stores import StoreAway
 from tests.drills.volume import Listing, Submission
-from tests.drills.workers import Lifetime
 from tests.service.plans import submit
 
 OF_ONE_DATABASE = {"sqlite-lock", "disk-full", "postgres"}
@@ -60,9 +59,8 @@ def one_api_process(monkeypatch: pytest.MonkeyPatch) -> None:
         DiskFull(runs=8, full_s=1.5),
         StoreAway(runs=12, away_s=2.0),
         StoppedWorker(runs=6),
-        Lifetime(runs=40, lifetime_s=2.0),
         TwoDispatchers(runs=20),
-        Poison(runs=24, batch=4),
+        Poison(runs=24),
     ],
     ids=lambda drill: drill.name,
 )

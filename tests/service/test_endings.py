@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import DataError, IntegrityError, OperationalError, ProgrammingError, StatementError
 
 from engine import engine_digest
-from service.dispatcher.outcomes import OtherEngine, read_answer
+from service.dispatcher.outcomes import OtherEngine, judge_answer
 from service.domain.payload import InvalidResultError, read_payload
 from service.domain.states import GridState
 from service.store.database import Database
@@ -41,7 +41,6 @@ def forgetful(url: str) -> Iterator[Forgetful]:
 
 def look_anew(setting: Setting) -> None:
     """Let the next step look at what was cancelled, and the next reconciliation be due."""
-    setting.dispatcher._looked = float("-inf")
     setting.dispatcher._due.clear()
 
 
@@ -66,7 +65,7 @@ def test_a_cancellation_whose_answer_is_lost_and_a_retry_wedge_nothing(forgetful
     setting.queue.__class__ = was
     assert setting.grids.grid(setting.grid_id).counts.cancelled == 2
     assert setting.grids.revive(setting.grid_id) == 2
-    setting.dispatcher._settings.window = None
+    setting.dispatcher._claims._window = None
     setting.run(until=lambda: len(pool.submitted) == 3)
     assert len({lease.token for _, lease in pool.placed[1:]}) == 1, "one claim took both"
     for future in (pool.futures[0], pool.futures[2]):
@@ -116,7 +115,6 @@ def test_an_ending_that_the_database_refuses_is_set_aside_and_the_loop_goes_on(
         setattr(setting.queue, name, refuses(getattr(setting.queue, name)))
     endings, flights = setting.dispatcher._endings, setting.dispatcher._flights
     flights.clear()
-    setting.dispatcher._slots.clear()
     if method == "store_all":
         endings.store([(lease, result_of(lease)) for lease in leases])
     elif method in {"suspect", "hand_back"}:
@@ -235,36 +233,6 @@ class Away(Database):
                 raise OperationalError("BEGIN", {}, Exception("the database is away"))
 
 
-@pytest.mark.parametrize("after", range(7))
-@pytest.mark.parametrize("stop", ["cancel", "pause"])
-def test_nothing_that_was_claimed_ahead_is_started_after_its_grid_is_stopped_wherever_the_database_goes_away(
-    sqlite_url: str, tmp_path: Path, stop: str, after: int
-) -> None:
-    """Away from any transaction of the look on; the workers become free meanwhile and before the next look."""
-    database, other = Away(sqlite_url), Database(sqlite_url)
-    pool = InstantPool(tmp_path, *["pending"] * 2)
-    setting = Setting(database, pool, runs=8, engine=engine_digest(), reconcile_s=0.02)
-    setting.dispatcher._brief.add(pool.engine)
-    setting.run(until=lambda: len(pool.submitted) == 2)
-    assert setting.grids.grid(setting.grid_id).counts.leased == 4
-    view = type(setting.grids)(other)
-    getattr(view, stop)(setting.grid_id)
-    look_anew(setting)
-    database.after = after
-    setting.run(steps=3, until=lambda: False)
-    for future in pool.futures:
-        future.finish(tmp_path)
-    setting.run(steps=5, until=lambda: False)
-    database.after = None
-    setting.run(steps=20, until=lambda: False)
-    assert len(pool.submitted) == 2, "a run was started after its grid was stopped"
-    counts = view.grid(setting.grid_id).counts
-    assert counts.leased == 0
-    assert counts.done + (counts.cancelled if stop == "cancel" else counts.paused) == 8
-    for each in (database, other):
-        each.close()
-
-
 def test_a_run_whose_lease_has_ended_without_the_dispatcher_is_stopped(sqlite_url: str, tmp_path: Path) -> None:
     database = Database(sqlite_url)
     pool = InstantPool(tmp_path, "pending", "pending")
@@ -325,17 +293,17 @@ def a_lease(engine: str | None = None) -> Lease:
 
 @pytest.mark.parametrize("permanent", [None, 1, "yes", [True], False])
 def test_nothing_but_a_plain_yes_forbids_another_attempt(permanent: object) -> None:
-    ending = read_answer(a_lease(), {"error": {"code": "error", "message": "", "permanent": permanent}})
+    ending = judge_answer(a_lease(), {"error": {"code": "error", "message": "", "permanent": permanent}})
     assert isinstance(ending, Failure)
     assert ending.retries == 2
-    ending = read_answer(a_lease(), {"error": {"code": "error", "message": ""}})
+    ending = judge_answer(a_lease(), {"error": {"code": "error", "message": ""}})
     assert isinstance(ending, Failure)
     assert ending.retries == 2
 
 
 @pytest.mark.parametrize("engine", [None, 7, "\x00" * 100, {"a": 1}, "x" * 10_000])
 def test_an_engine_that_is_no_digest_is_another_engine(engine: object) -> None:
-    ending = read_answer(a_lease("e" * 64), {"payload": {}, "engine": engine})
+    ending = judge_answer(a_lease("e" * 64), {"payload": {}, "engine": engine})
     assert isinstance(ending, OtherEngine)
     assert len(ending.digest) <= 64
     assert "\x00" not in ending.digest
@@ -381,11 +349,10 @@ def test_suspects_of_two_engines_take_turns_and_neither_clears_the_other_s_lane(
     served: list[str] = []
     submits = pool.submit
 
-    def noted(leases: Sequence[Lease], worker: Any) -> Any:
+    def noted(lease: Lease, worker: Any) -> Any:
         served.append(worker.engine[:1])
-        future = submits(leases, worker)
-        answers = [{**answer, "engine": worker.engine} for answer in json.loads(future._answers)["answers"]]
-        future._answers = to_bytes({"answers": answers})
+        future = submits(lease, worker)
+        future._answers = to_bytes({"answer": {**json.loads(future._answers)["answer"], "engine": worker.engine}})
         return future
 
     pool.submit = noted  # type: ignore[method-assign]

@@ -20,21 +20,23 @@ from typer.testing import CliRunner
 
 import engine.figures
 from engine.result import (
-    ESTIMATORS,
     INDEX_PRIORS,
     Aperture,
     ChainSummary,
     Estimate,
+    ImagePlane,
     LensParameter,
+    Products,
     Quantity,
     RunResult,
+    SourcePlane,
     StageTime,
 )
-from engine.spec.analysis import Analysis
+from engine.spec.analysis import ESTIMATORS, Analysis
 from service.api.app import create_app
 from service.cli.app import app
 from service.dispatcher.identity import is_dead, own_name
-from service.dispatcher.outcomes import OtherEngine, clean, read_answer, read_exception
+from service.dispatcher.outcomes import OtherEngine, clean, judge_answer, read_exception
 from service.dispatcher.pickle_guard import read_error
 from service.domain.identifiers import utc_now
 from service.domain.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
@@ -43,8 +45,8 @@ from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
-from service.worker.answers import LIMIT_BYTES, NotPlainError, read_answers, to_bytes
-from service.worker.tasks import call_task, call_tasks, execute
+from service.worker.answers import LIMIT_BYTES, NotPlainError, read_answer, to_bytes
+from service.worker.tasks import answer_run, call_task, execute
 from tests.service.plans import planned
 from tests.service.tasks import PNG, synthetic_payload
 
@@ -81,6 +83,17 @@ def engine_result(**changes: Any) -> RunResult:
         "stages": (StageTime("forward", 1.0, 0.5), StageTime("posterior", 2.0, 2.0)),
     }
     return RunResult(**(whole | changes))
+
+
+def test_a_result_without_a_chain_is_a_payload_too() -> None:
+    image = [found for found in engine_result().estimates if found.estimator == "image"]
+    lone = engine_result(
+        estimates=tuple(image), chain=None, ln_evidence=None, condition_number=None, aperture=None
+    )  # fmt: skip
+    payload = ResultPayload.model_validate_json(result_payload(lone).model_dump_json())
+    assert (payload.chain, payload.ln_evidence, payload.condition_number, payload.aperture) == (None,) * 4
+    assert {name for name, found in payload.estimates.items() if found} == {"image_wide", "image_free", "image_fixed"}
+    assert payload.chi2 == 5.0
 
 
 def test_an_engine_result_becomes_a_payload_that_survives_json() -> None:
@@ -134,16 +147,16 @@ def test_a_worker_answers_with_data_whatever_happens() -> None:
 
 def test_answers_are_judged() -> None:
     good = {"payload": synthetic_payload(SPEC)}
-    assert read_answer(lease(), good) == read_payload(good["payload"])
+    assert judge_answer(lease(), good) == read_payload(good["payload"])
     for answer in (None, {}, {"payload": {}}, {"payload": {**good["payload"], "realization_digest": "0" * 64}}):
-        ending = read_answer(lease(), answer)
+        ending = judge_answer(lease(), answer)
         assert isinstance(ending, Failure)
         assert (ending.code, ending.retries) == ("invalid_result", 0)
     assert read_exception(ValueError("x")).outcome is Outcome.ERROR
     mine = dataclasses.replace(lease(), engine="e" * 64)
-    assert read_answer(mine, {**good, "engine": "e" * 64}) == read_payload(good["payload"])
-    assert read_answer(mine, {**good, "engine": "f" * 64}) == OtherEngine("f" * 64)
-    assert read_answer(mine, good) == OtherEngine("None")
+    assert judge_answer(mine, {**good, "engine": "e" * 64}) == read_payload(good["payload"])
+    assert judge_answer(mine, {**good, "engine": "f" * 64}) == OtherEngine("f" * 64)
+    assert judge_answer(mine, good) == OtherEngine("None")
     assert clean("a\x00b\ud800") == "a\ufffdb?"
 
 
@@ -217,8 +230,9 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flat = np.zeros((4, 5))
-    values = {"image": flat, "model": flat, "source_truth": None, "names": ("a", "b")}
-    products = dataclasses.make_dataclass("Products", list(values))(**values)
+    image = ImagePlane(flat, flat, flat, flat, flat, flat > 0, 0.08)
+    edges, samples = np.arange(6.0), np.zeros((2, 1))
+    products = Products(image, SourcePlane(flat, flat, edges, edges[:5], samples, ("theta_E",)))
     digest = planned(1)[0].digest
     monkeypatch.setattr(
         engine, "run", lambda realization: engine_result(realization_digest=realization.digest, products=products)
@@ -231,7 +245,8 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     assert payload.products is not None
     assert store.read(payload.figure.key).startswith(b"\x89PNG")
     with np.load(store.path(payload.products.key), allow_pickle=False) as arrays:
-        assert set(arrays) == {"image", "model", "names"}
+        assert {"image", "model", "mask", "pixel_scale", "source", "chain", "parameter_names"} <= set(arrays)
+        assert not {"source_truth", "source_plane"} & set(arrays)
         assert arrays["image"].shape == (4, 5)
 
 
@@ -249,24 +264,24 @@ def test_a_worker_is_greeted_with_its_engine_one_thread_and_warm_kernels() -> No
 
 
 def test_answers_of_workers_are_plain_data_of_a_bounded_size_and_nothing_else() -> None:
-    good = {"answers": [{"payload": {}, "engine": "e"}, {"error": {}}], "memory": 7}
-    assert read_answers(to_bytes(good), 2).memory == 7
+    good = {"answer": {"payload": {}, "engine": "e"}, "memory": 7}
+    assert read_answer(to_bytes(good)).memory == 7
     wrong: tuple[object, ...] = (
         good,
         to_bytes(good).decode(),
         pickle.dumps(good),
         b"",
         b"[" * 100_000,
-        b'{"answers":[' + b"9" * 10_000 + b"]}",
-        to_bytes({**good, "answers": good["answers"] * 2}),
-        to_bytes({**good, "answers": [1, 2]}),
+        b'{"answer":' + b"9" * 10_000 + b"}",
+        to_bytes({"memory": 7}),
+        to_bytes({**good, "answer": [1, 2]}),
         to_bytes({**good, "more": 1}),
         to_bytes({**good, "memory": -1}),
-        b" " * (3 * LIMIT_BYTES + 1),
+        b" " * (2 * LIMIT_BYTES + 1),
     )
     for said in wrong:
         with pytest.raises(NotPlainError):
-            read_answers(said, 2)
+            read_answer(said)
 
 
 def test_what_a_task_answers_leaves_the_worker_as_plain_data_or_as_an_error_that_says_why(
@@ -274,11 +289,12 @@ def test_what_a_task_answers_leaves_the_worker_as_plain_data_or_as_an_error_that
 ) -> None:
     answers: dict[str, Any] = {"object": object(), "huge": "x" * LIMIT_BYTES, "well": 1}
     monkeypatch.setattr("tests.service.tasks.fast", lambda spec, _: answers[spec])
-    said = read_answers(call_tasks("tests.service.tasks:fast", list(answers), str(tmp_path)), 3)  # type: ignore[arg-type]
-    assert [answer.get("error", {}).get("code") for answer in said.answers] == ["invalid_result"] * 2 + [None]
-    assert said.memory > 0
+    task = "tests.service.tasks:fast"
+    said = [read_answer(answer_run(task, spec, str(tmp_path))) for spec in answers]  # type: ignore[arg-type]
+    assert [one.answer.get("error", {}).get("code") for one in said] == ["invalid_result"] * 2 + [None]
+    assert all(one.memory > 0 for one in said)
     monkeypatch.setattr("tests.service.tasks.fast", _no_memory)
-    (answer,) = read_answers(call_tasks("tests.service.tasks:fast", [{}], str(tmp_path)), 1).answers
+    answer = read_answer(answer_run(task, {}, str(tmp_path))).answer
     assert answer["error"]["code"] == "memory"
 
 

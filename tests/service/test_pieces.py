@@ -14,6 +14,7 @@ from sqlalchemy import Connection, func, select, text
 from sqlalchemy.event import listen, remove
 
 from service.api.app import create_app
+from service.domain.plan import PlannedRun
 from service.domain.requests import GridRequest, plan
 from service.domain.states import GridState
 from service.runtime.settings import Settings
@@ -25,7 +26,7 @@ from service.store.leadership import Leadership
 from service.store.leases import Outcome
 from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
-from service.store.submission import PlannedRun, SubmissionLostError
+from service.store.submission import SubmissionLostError
 from service.store.tables import grid, idempotency, run
 from service.store.upkeep import PATIENCE_S, Upkeep
 from tests.service.conftest import empty
@@ -485,7 +486,6 @@ LOOKS: dict[str, Callable[[Database, int], object]] = {
     "waiting": lambda database, _: RunQueue(database).waiting("e" * 64),
     "forgotten": lambda database, generation: RunQueue(database).requeue_forgotten(generation, []),
     "to cancel": lambda database, generation: RunQueue(database).to_cancel(generation),
-    "to hold": lambda database, generation: RunQueue(database).to_hold(generation),
     "post-dated": lambda database, _: RunQueue(database).release_postdated(),
     "depth": lambda database, _: QueueDepth(database).look(),
     "upkeep": lambda database, _: Upkeep(database).step(),

@@ -77,18 +77,6 @@ def test_no_worker_is_kept_empty_while_the_suspect_of_another_engine_is_under_wa
     assert slots.lane("e", [FOUR]) == FOUR
 
 
-def test_workers_that_have_lived_long_are_started_anew_when_idle_and_not_all_at_once() -> None:
-    workers = [Worker(f"tcp://10.0.0.{k}:1", 1, "e", 0.0) for k in range(200)]
-    assert Slots().outlived(workers, 1e9) == []
-    slots = Slots(100.0)
-    assert slots.outlived(workers, 79.0) == []
-    half = slots.outlived(workers, 100.0)
-    assert 60 < len(half) < 140
-    assert len(slots.outlived(workers, 121.0)) == 200
-    slots.take(half[0], "1", alone=False)
-    assert half[0] not in slots.outlived(workers, 121.0)
-
-
 def test_one_run_on_a_dead_worker_did_it_and_of_several_nobody_can_tell() -> None:
     deaths: Deaths[str] = Deaths(judge_after_s=1.0)
     assert deaths.judge(0.0) is None

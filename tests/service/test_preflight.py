@@ -185,6 +185,10 @@ def test_what_the_settings_name_is_looked_at_before_a_start(tmp_path: Path, monk
     assert "HOSTLENS_DATABASE_URL" in refusal(Settings(data_dir=data, port=port, database_url=nowhere))
     tls = {"tls_ca": file, "tls_cert": file, "tls_key": file, "scheduler_address": "tls://x:1"}
     assert "HOSTLENS_TLS_CA" in refusal(Settings.model_validate({"data_dir": data, "port": port, **tls}))
+    os.mkfifo(tmp_path / "pipe")
+    tls["tls_ca"] = tmp_path / "pipe"
+    assert "not a regular file" in refusal(Settings.model_validate({"data_dir": data, "port": port, **tls}))
+    assert "takes no files" in refusal(Settings(data_dir=data, port=port, artefact_url="http://127.0.0.1/store"))
     assert "HOSTLENS_TASK: there is no module" in refusal(Settings(data_dir=data, port=port, task="no.such:task"))
     monkeypatch.setitem(sys.modules, "psycopg.pq", None)
     remote = Settings(data_dir=data, port=port, database_url="postgresql://h/x")

@@ -761,3 +761,26 @@ def test_a_thousand_leases_end_together_in_well_under_a_second(
     took = time.process_time() - began
     print(f"{took * 1000:.0f} ms of CPU here")
     assert took < 2.0
+
+
+def test_a_run_whose_specification_nobody_can_read_fails_with_its_reason_and_keeps_no_other_from_being_claimed(
+    database: Database, grids: GridStore, queue: RunQueue, generation: int
+) -> None:
+    """Only a change by hand makes such a row; PostgreSQL itself refuses text that is no JSON, but not a list."""
+    grid_id = submit(grids, 3)
+    broken = grids.runs(grid_id, 3).items[0].id
+    spoilt = "'[1, 2'" if database.url.startswith("sqlite") else "'[1, 2]'::json"
+    with database.write() as connection:
+        connection.execute(text(f"UPDATE run SET spec = {spoilt} WHERE id = :id"), {"id": broken})  # noqa: S608
+    leases = queue.claim(generation, 10)
+    assert len(leases) == 2
+    assert broken not in {lease.run_id for lease in leases}
+    assert queue.claim(generation, 10) == []
+    with database.read() as connection:
+        row = connection.execute(select(run.c.state, run.c.error_code, run.c.error_detail).where(run.c.id == broken))
+        assert tuple(row.one()) == ("failed", "invalid_spec", "the stored specification is not a JSON object")
+        kinds = connection.scalars(select(event.c.kind).where(event.c.run_id == broken)).all()
+        assert kinds == ["run_failed"]
+    for lease in leases:
+        queue.store(lease, result_of(lease))
+    assert grids.grid(grid_id).state is GridState.FAILED

@@ -25,7 +25,7 @@ from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.leases import Outcome
-from service.store.orphans import FOREIGN, REFERRED, YOUNG, Orphans, oldest_kept
+from service.store.orphans import DAMAGED, FOREIGN, REFERRED, YOUNG, Orphans, oldest_kept
 from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
 from service.store.retention import NEWEST, OPEN, YOUNGER, Retention, Share
@@ -201,18 +201,19 @@ def test_only_old_files_that_no_result_refers_to_go(store_url: str) -> None:
     store = ArtefactStore(store_url)
     referred, orphan, young = (store.put(data, "png").key for data in (b"referred", b"orphan", b"young"))
     partial, young_partial = f"{orphan}.{uuid4().hex}.partial", f"{young}.{uuid4().hex}.partial"
-    for name in (partial, young_partial, "README", "ab/notes.txt"):
+    damaged = f"{orphan}.{uuid4().hex}.damaged/what_was_there"
+    for name in (partial, young_partial, "README", "ab/notes.txt", ".probe", damaged):
         write(store_url, name)
-    for name in (referred, orphan, partial, "README", "ab/notes.txt"):
+    for name in (referred, orphan, partial, "README", "ab/notes.txt", ".probe", damaged):
         age_file(store_url, name, 10.0)
     orphans = Orphans(store_url, datetime.now(UTC) - 2 * DAYS)
     found = orphans.sort(orphans.listed(), {referred})
-    assert (found.orphans, found.partial) == ([orphan], [partial])
-    assert {why: files for why, (files, _) in found.kept.items()} == {REFERRED: 1, YOUNG: 2, FOREIGN: 2}
+    assert (found.orphans, set(found.partial)) == ([orphan], {partial, ".probe"})
+    assert {why: files for why, (files, _) in found.kept.items()} == {REFERRED: 1, YOUNG: 2, FOREIGN: 2, DAMAGED: 1}
     assert found.sizes[orphan] == len(b"orphan")
-    assert [orphans.remove(name) for name in found.orphans + found.partial] == [True, True]
+    assert [orphans.remove(name) for name in found.orphans + found.partial] == [True, True, True]
     assert sorted(name for name, _, _ in orphans.listed()) == sorted(
-        [referred, young, young_partial, "README", "ab/notes.txt"]
+        [referred, young, young_partial, "README", "ab/notes.txt", damaged]
     )
     assert not orphans.remove(orphan)
 

@@ -1,0 +1,46 @@
+"""Addresses: what the store and the domain answer is given its links here, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from service.domain.views import GridView, Links, RunView, SystemItem
+
+_ACTIONS = ("cancel", "pause", "resume", "retry")
+_SystemT = TypeVar("_SystemT", bound=SystemItem)
+
+
+def link_grid(grid: GridView) -> GridView:
+    """A grid with the addresses of its parts and of what may be done to it."""
+    own = f"/v1/grids/{grid.id}"
+    parts = {name: f"{own}/{name}" for name in ("runs", "summary", "events", *_ACTIONS)}
+    return grid.model_copy(update={"links": {"self": own, **parts}})
+
+
+def link_grids(grids: Sequence[GridView]) -> list[GridView]:
+    """Each as :func:`link_grid`."""
+    return [link_grid(grid) for grid in grids]
+
+
+def link_runs(runs: Sequence[RunView]) -> list[RunView]:
+    """Each with its own address and that of its grid."""
+    return [run.model_copy(update={"links": _run_links(run.id, run.grid_id)}) for run in runs]
+
+
+def link_document(document: dict[str, Any]) -> dict[str, Any]:
+    """A run as plain data, with these addresses and, where it has one, that of its figure."""
+    links = _run_links(document["id"], document["grid_id"])
+    result = document["result"]
+    if result is not None and result["figure"] is not None:
+        links["figure"] = f"{links['self']}/figure"
+    return document | {"links": links}
+
+
+def _run_links(run_id: str, grid_id: str) -> Links:
+    return {"self": f"/v1/runs/{run_id}", "grid": f"/v1/grids/{grid_id}"}
+
+
+def link_system(system: _SystemT) -> _SystemT:
+    """A lens system of the catalogue with its own address."""
+    return system.model_copy(update={"links": {"self": f"/v1/systems/{system.name}"}})

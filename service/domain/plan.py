@@ -1,0 +1,29 @@
+"""The runs that a grid means, as they are handed to whoever stores them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a grid that is about to be stored."""
+
+    label: str
+    paper_run: int | None
+    spec: dict[str, Any]
+    inputs: dict[str, Any]
+    digest: str
+    kind: str = "realization"
+
+
+class Plan(Protocol):
+    """Runs whose number is known, made as they are asked for, the same each time."""
+
+    def __len__(self) -> int:
+        """How many there are."""
+
+    def __iter__(self) -> Iterator[PlannedRun]:
+        """Begin with the first."""
