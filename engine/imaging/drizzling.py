@@ -126,20 +126,20 @@ def drizzle_weights(geometry: Geometry) -> sparse.csr_matrix:
 def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
     """W with equal weights.
 
-    Found by drizzling combs of impulses so far apart that their footprints cannot touch; for each exposure apart,
-    then put together as the package does, by the weights it reports.
+    Found by drizzling images of single bright pixels, so far apart that no two reach the same drizzled pixel; each
+    exposure by itself, then put together as the package does, by the weights it reports.
     """
-    step = _comb_step(geometry)
+    step = _impulse_spacing(geometry)
     weight_sum = np.zeros(geometry.drizzled_shape)
     rows, columns, values = [], [], []
     n_native = math.prod(geometry.native_shape)
     for index in range(geometry.n_dither):
         nearest = [_nearest(axis, geometry, index, step) for axis in (0, 1)]
         for j, i in np.ndindex(step, step):
-            comb = np.zeros(geometry.native_shape)
-            comb[j::step, i::step] = 1.0
+            impulses = np.zeros(geometry.native_shape)
+            impulses[j::step, i::step] = 1.0
             one = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True, fillval=0.0)
-            _add(one, comb, geometry, index, None)
+            _add(one, impulses, geometry, index, None)
             weight = np.asarray(one.out_wht, dtype=np.float64)
             product = np.asarray(one.out_img, dtype=np.float64) * weight
             row, column = np.nonzero(product)
@@ -147,7 +147,7 @@ def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
             source = nearest[0][i][column] + geometry.native_shape[1] * nearest[1][j][row]
             columns.append(index * n_native + source)
             values.append(product[row, column])
-        weight_sum += weight  # every comb of an exposure reports the same weights
+        weight_sum += weight  # every image of an exposure reports the same weights
     matrix = sparse.coo_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(math.prod(geometry.drizzled_shape), geometry.n_dither * n_native),
@@ -159,7 +159,7 @@ def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
     return matrix
 
 
-def _comb_step(geometry: Geometry) -> int:
+def _impulse_spacing(geometry: Geometry) -> int:
     """Distance in native pixels at which the footprints of two impulses share no drizzled pixel.
 
     A droplet is pixfrac wide and reaches every drizzled pixel that it touches, or at least the nearest one.
@@ -168,18 +168,15 @@ def _comb_step(geometry: Geometry) -> int:
 
 
 def _nearest(axis: int, geometry: Geometry, index: int, step: int) -> list[np.ndarray[tuple[int], np.dtype[np.intp]]]:
-    """Find, for each phase of the comb, the native index of the tooth nearest to every drizzled pixel.
-
-    Axis 0 is x.
-    """
+    """Native index of the impulse nearest to every drizzled pixel, for each place of the first; axis 0 is x."""
     native, drizzled = geometry.native_axes(index)[axis], geometry.drizzled_axes()[axis]
     n = len(native)
     position = (drizzled - native[0]) / geometry.pixel_scale
     result = []
     for phase in range(step):
-        teeth = (n - 1 - phase) // step
-        tooth = np.clip(np.rint((position - phase) / step), 0, max(teeth, 0))
-        result.append((phase + step * tooth).astype(np.intp))
+        last = (n - 1 - phase) // step
+        impulse = np.clip(np.rint((position - phase) / step), 0, max(last, 0))
+        result.append((phase + step * impulse).astype(np.intp))
     return result
 
 
