@@ -7,14 +7,13 @@ whole of it (:mod:`.refine`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
-from engine.conventions import FloatArray, ellipticity_jacobian
+from engine.conventions import FloatArray
 from engine.errors import PosteriorError, SpecError
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
@@ -33,7 +32,6 @@ from engine.spec.priors import LensParameterName, ParameterPrior
 
 __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametric"]
 
-HOST_NAMES = ("flux", "r_eff", "n", "q", "phi", "x", "y")
 GOOD_START = Acceptance()
 
 
@@ -42,12 +40,11 @@ class ParametricFit:
     """The best parametric model of an observation.
 
     ``host.flux`` and ``deflector.flux`` are the fitted fluxes [e-/s]; ``agn`` are the fitted positions and fluxes;
-    ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, ``host_covariance`` (7, 7)
-    that of the host's in the order of :data:`HOST_NAMES`, both with all other parameters free and multiplied by
-    chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx),
-    their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many times
-    what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host with
-    each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of everything and
+    ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, all other parameters free,
+    multiplied by chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma``
+    (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
+    times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
+    with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
     of the lensed host [e-/s].
     """
 
@@ -58,7 +55,6 @@ class ParametricFit:
     background: float
     lens_names: tuple[str, ...]
     lens_covariance: FloatArray
-    host_covariance: FloatArray
     hosts: Mapping[IndexPrior, HostPosterior]
     chi2: float
     degrees_of_freedom: int
@@ -166,7 +162,6 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         background=float(amplitudes[BACKGROUND]),
         lens_names=space.lens_names,
         lens_covariance=space.lens_covariance(covariance, values),
-        host_covariance=_host_covariance(hosts["wide"]),
         hosts=hosts,
         chi2=chi2,
         degrees_of_freedom=freedom,
@@ -176,12 +171,3 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         arc=(columns[:, HOST_FLUX] * flux).reshape(shape),
         sigma=model.sigma,
     )
-
-
-def _host_covariance(host: HostPosterior) -> FloatArray:
-    """Covariance (7, 7) of :data:`HOST_NAMES`, by the chain rule."""
-    ln_flux, ln_r, _, e1, e2, _, _ = host.mean.tolist()
-    chain = np.eye(7)
-    chain[0, 0], chain[1, 1] = math.exp(ln_flux), math.exp(ln_r)
-    chain[3:5, 3:5] = ellipticity_jacobian(e1, e2)
-    return np.asarray(chain @ host.covariance @ chain.T)
