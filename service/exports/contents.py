@@ -18,7 +18,7 @@ from service.store.tables import input_group, result, run
 
 _CELLS = 2**18
 """In a piece of an export: some tens of megabytes as Python's objects."""
-Rows = Sequence[tuple[Any, ...]]
+Rows = Sequence[Sequence[Any]]
 
 SPEC_COLUMNS = (
     ResultColumn("spec", str, "realization as JSON: what hostlens replay computes again", None, cast(run.c.spec, Text)),
@@ -101,11 +101,19 @@ def survey(connection: Connection, question: Question, now: datetime) -> Content
 
 
 def pieces(connection: Connection, question: Question, columns: Sequence[ResultColumn]) -> Iterator[Rows]:
-    """The rows, some at a time, in constant memory."""
+    """The rows, some at a time, in constant memory; times are text, for want of a type that all formats have."""
+    times = [place for place, column in enumerate(columns) if column.kind is datetime]
     rows = result_rows(connection, question.where, question.estimates, columns)
     size = max(1, _CELLS // len(columns))
     while piece := list(islice(rows, size)):
-        yield piece
+        yield [_told(row, times) for row in piece]
+
+
+def _told(row: tuple[Any, ...], times: Sequence[int]) -> list[Any]:
+    values = list(row)
+    for place in times:
+        values[place] = stamp(values[place])
+    return values
 
 
 def stamp(moment: datetime) -> str:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
-from typing import Any, BinaryIO
+from collections.abc import Iterable
+from typing import BinaryIO
 
-from service.exports.contents import Contents, Rows, stamp
-from service.exports.template import empty_table, text_places
+from service.exports.contents import Contents, Rows
+from service.exports.template import empty_table
 
 
 def write_csv(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) -> None:
@@ -25,22 +25,13 @@ def write_ecsv(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) -> No
 
 
 def _write(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO, header: str) -> None:
-    _, times = text_places(contents)
     text = io.StringIO(newline="")
     text.write(header)
     lines = csv.writer(text, lineterminator="\n")
     lines.writerow([column.name for column in contents.columns])
     for piece in pieces:
-        lines.writerows(_told(piece, times))
+        lines.writerows(piece)
         sink.write(text.getvalue().encode())
         text.seek(0)
         text.truncate()
     sink.write(text.getvalue().encode())
-
-
-def _told(piece: Rows, times: list[int]) -> Iterator[list[Any]]:
-    for row in piece:
-        values = list(row)
-        for place in times:
-            values[place] = stamp(values[place])
-        yield values

@@ -23,7 +23,9 @@ def write_fits(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) -> No
     A number that is not there is NaN or TNULL, a text empty. FITS has ASCII alone: other characters are escaped as
     Python does it. Descriptions stand as TCOMM and, for Astropy, once more in the form that its reader looks for.
     """
-    octets = {name: width.octets if width.is_ascii else 10 * width.characters for name, width in contents.widths.items()}
+    octets = {
+        name: width.octets if width.is_ascii else 10 * width.characters for name, width in contents.widths.items()
+    }
     kind = record_type(contents, octets)
     sink.write(_head(contents, octets, kind.itemsize))
     encode = {name: _encoder(width) for name, width in contents.widths.items()}
@@ -38,9 +40,9 @@ def write_fits(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) -> No
 def _head(contents: Contents, octets: dict[str, int], row: int) -> bytes:
     from astropy.io import fits  # noqa: PLC0415 - takes a while
 
-    text = io.BytesIO()
-    empty_table(contents, {}).write(text, format="fits")
-    with fits.open(io.BytesIO(text.getvalue())) as units:
+    data = io.BytesIO()
+    empty_table(contents, {}).write(data, format="fits")
+    with fits.open(io.BytesIO(data.getvalue())) as units:
         primary, header = units[0].header, units[1].header
     header["NAXIS1"], header["NAXIS2"] = row, contents.rows
     header["EXTNAME"] = "RESULTS"
@@ -52,7 +54,8 @@ def _head(contents: Contents, octets: dict[str, int], row: int) -> bytes:
         header[f"TCOMM{place}"] = column.description
     for name, value in flat_provenance(contents).items():
         header[_KEYWORDS[name]] = value.encode("ascii", "backslashreplace").decode()
-    return (primary.tostring() + header.tostring()).encode("ascii")
+    text: str = primary.tostring() + header.tostring()
+    return text.encode("ascii")
 
 
 def _encoder(width: Width) -> Encode:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from service.exports.contents import Contents, Rows
@@ -18,7 +17,7 @@ _CELLS = 2**21
 
 
 def write_parquet(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) -> None:
-    """Groups of rows, compressed; nulls where there is no value, times with their zone.
+    """Groups of rows, compressed; nulls where there is no value.
 
     The metadata hold Astropy's ``table_meta_yaml`` and a VOTable without data (VOParquet 1.0).
     """
@@ -44,23 +43,15 @@ def _schema(contents: Contents) -> pyarrow.Schema:
     import pyarrow  # noqa: PLC0415
     from astropy.table import meta  # noqa: PLC0415
 
-    kinds = {
-        str: pyarrow.string(),
-        int: pyarrow.int64(),
-        float: pyarrow.float64(),
-        datetime: pyarrow.timestamp("us", tz="UTC"),
-    }
+    kinds: dict[type, Any] = {int: pyarrow.int64(), float: pyarrow.float64()}
     table = empty_table(contents)
     fields = []
     for column in contents.columns:
         unit = table[column.name].unit
         told = {"description": table[column.name].description} | ({} if unit is None else {"unit": str(unit)})
-        fields.append(pyarrow.field(column.name, kinds[column.kind], metadata=told))
-    lengths = {
-        f"table::len::{name}": str(width.characters)
-        for name, width in contents.widths.items()
-    }
-    head, tail = document(contents, '<PARQUET type="Parquet-local-XML"/>', fixed=False)
+        fields.append(pyarrow.field(column.name, kinds.get(column.kind, pyarrow.string()), metadata=told))
+    lengths = {f"table::len::{name}": str(width.characters) for name, width in contents.widths.items()}
+    head, tail = document(contents, '<PARQUET type="Parquet-local-XML"/>')
     metadata = {
         "table_meta_yaml": "\n".join(meta.get_yaml_from_table(table)),
         "IVOA.VOTable-Parquet.version": "1.0",

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.exports.contents import Contents, Rows, stamp
-from service.exports.template import text_places
+from service.exports.contents import Contents, Rows
 
 NO_INTEGER = -(2**63)
 """Stands for an integer that is not there where a format has no other way to say so."""
@@ -27,16 +26,14 @@ def record_type(contents: Contents, octets: Mapping[str, int], before: int = 0) 
 def records(piece: Rows, contents: Contents, kind: np.dtype[Any], encode: Mapping[str, Encode]) -> NDArray[Any]:
     """Rows as records: what is not there is NaN, :data:`NO_INTEGER` or an empty text."""
     found = np.zeros(len(piece), dtype=kind)
-    _, times = text_places(contents)
-    for place, (column, values) in enumerate(zip(contents.columns, zip(*piece, strict=True), strict=True)):
+    for column, values in zip(contents.columns, zip(*piece, strict=True), strict=True):
         if column.kind is float:
             found[column.name] = np.array(values, dtype=np.float64)  # None becomes NaN
         elif column.kind is int:
             found[column.name] = [NO_INTEGER if value is None else value for value in values]
         else:
-            texts = map(stamp, values) if place in times else values
             write = encode[column.name]
-            found[column.name] = [b"" if text is None else write(text) for text in texts]
+            found[column.name] = [b"" if text is None else write(text) for text in values]
     return found
 
 

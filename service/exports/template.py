@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from service.exports.contents import Contents
@@ -35,15 +34,4 @@ def empty_table(contents: Contents, meta: Mapping[str, Any] | None = None) -> Ta
 
 def flat_provenance(contents: Contents) -> dict[str, str]:
     """The provenance for headers that keep text alone; what is not text is JSON."""
-    return {
-        name: value if isinstance(value, str) else json.dumps(value) for name, value in contents.provenance.items()
-    }
-
-
-def text_places(contents: Contents) -> tuple[list[int], list[int]]:
-    """Places of the columns that are text, and of those that are times."""
-    kinds = [column.kind for column in contents.columns]
-    return (
-        [place for place, kind in enumerate(kinds) if kind is str],
-        [place for place, kind in enumerate(kinds) if kind is datetime],
-    )
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in contents.provenance.items()}

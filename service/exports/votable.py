@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import binascii
 import io
+import re
 from collections.abc import Iterable
 from typing import BinaryIO
 
@@ -12,6 +13,7 @@ from service.exports.records import Encode, missing, record_type, records
 from service.exports.template import empty_table, flat_provenance
 
 _MARK = "<!--rows-->"
+_DESCRIPTION = re.compile(r"<DESCRIPTION>.*?</DESCRIPTION>", re.DOTALL)
 
 
 def write_votable(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) -> None:
@@ -34,11 +36,8 @@ def write_votable(pieces: Iterable[Rows], contents: Contents, sink: BinaryIO) ->
     sink.write(tail.encode())
 
 
-def document(contents: Contents, data: str, *, fixed: bool = True) -> tuple[str, str]:
-    """The XML before and after the rows, where ``data`` is the element that holds or names them.
-
-    Texts have the length of the longest where it is ``fixed``; a reader of any other form asks for no length.
-    """
+def document(contents: Contents, data: str) -> tuple[str, str]:
+    """The XML before and after the rows, where ``data`` is the element that holds or names them."""
     from astropy.io.votable import from_table  # noqa: PLC0415 - takes a while, as below
     from astropy.io.votable.tree import Info  # noqa: PLC0415
 
@@ -50,11 +49,15 @@ def document(contents: Contents, data: str, *, fixed: bool = True) -> tuple[str,
     for field in table.fields:
         if field.name in contents.widths:
             width = contents.widths[field.name]
-            field.datatype = "char" if width.is_ascii or not fixed else "unicodeChar"
-            field.arraysize = str(width.characters if width.is_ascii else width.octets) if fixed else "*"
+            field.datatype = "char" if width.is_ascii else "unicodeChar"
+            field.arraysize = str(width.octets)
     text = io.BytesIO()
     file.to_xml(text)
-    before, _, after = text.getvalue().decode().partition("</TABLE>")
+    # Its writer breaks lines, which readers take for part of a description.
+    unbroken = _DESCRIPTION.sub(
+        lambda found: " ".join(found[0].split()).replace("> ", ">").replace(" <", "<"), text.getvalue().decode()
+    )
+    before, _, after = unbroken.partition("</TABLE>")
     before = before.partition("<DATA>")[0]
     head, _, tail = f"{before}{data}\n</TABLE>{after}".partition(_MARK)
     return head, tail
