@@ -37,7 +37,7 @@ _COUNT_NAMES = {
     "r_eff_at_bound": "draws whose fit ended at a bound of r_eff",
     "failed": "draws that could not be fitted",
 }
-_LENS_UNITS = {"theta_E": _ARCSEC, "phi": _DEGREE, "x": _ARCSEC, "y": _ARCSEC}
+_LENS_UNITS = {"theta_E": _ARCSEC, "phi": "rad", "x": _ARCSEC, "y": _ARCSEC}
 _PARTS = {
     "mean": "mean over the draws",
     "sd": "standard deviation over the draws",

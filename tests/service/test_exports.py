@@ -114,7 +114,7 @@ def of_table(table: Table, columns: tuple[ResultColumn, ...]) -> dict[str, list[
 def assert_described(table: Table, columns: tuple[ResultColumn, ...]) -> None:
     assert str(table["magnitude_mean"].unit) == "mag"
     assert str(table["r_eff_sd"].unit) == "arcsec"
-    assert str(table["lens_phi_mean"].unit) == "deg"
+    assert str(table["lens_phi_mean"].unit) == "rad"
     assert table["surface_brightness"].unit.to_string("vounit") == "mag.arcsec**-2"
     for column in columns:
         assert table[column.name].description.startswith(column.description)
