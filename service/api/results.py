@@ -189,7 +189,7 @@ def results(request: Request, response: Response, service: Service, query: Annot
     columns = result_columns(names)
     keys = [column.name for column in columns]
     with service.database.read() as connection:
-        found = result_rows(connection, _filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
+        found = result_rows(connection, read_filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
         rows = [dict(zip(keys, row, strict=True)) for row in found]
     following = rows[query.limit - 1]["run_id"] if len(rows) > query.limit else None
     answer = {
@@ -209,7 +209,8 @@ def _given(query: BaseModel) -> dict[str, list[str]]:
     return {name: getattr(query, name) for name in AXES if getattr(query, name)}
 
 
-def _filter(query: BaseModel) -> ResultFilter:
+def read_filter(query: BaseModel) -> ResultFilter:
+    """The results that a query means; an InvalidRequestError at the parameter that cannot be read."""
     try:
         return ResultFilter.read(_given(query))
     except FilterError as error:
@@ -217,7 +218,7 @@ def _filter(query: BaseModel) -> ResultFilter:
 
 
 def _question(query: AnswerQuery) -> Question:
-    return Question(_filter(query), query.quantity, query.estimator, query.index_prior)
+    return Question(read_filter(query), query.quantity, query.estimator, query.index_prior)
 
 
 def _axes(group_by: str) -> tuple[str, ...]:
