@@ -10,7 +10,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
 
 from service import VERSION
-from service.api import catalogue, downloads, events, figures, grids, health, problems, results
+from service.api import catalogue, downloads, events, figures, grids, health, problems, results, site
 from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
@@ -85,4 +85,5 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     figures.install(app)
     for room in (grids, figures, results, events, catalogue, health):
         app.include_router(room.router)
+    site.install(app)
     return app
