@@ -24,6 +24,7 @@ HEADERS = {
     "Cache-Control": "no-cache",
     "Vary": "Accept",
 }
+_PRIORS = {"wide": "n in 0.3–8", "free": "n in 1–4", "fixed": "n fixed"}  # noqa: RUF001 - ranges
 _STEPS = ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"))
 
 
@@ -82,6 +83,12 @@ def duration(seconds: float | None) -> str:
     return f"{seconds:.0f} s"
 
 
+def estimate_name(name: str) -> str:
+    """An estimate in words: the estimator, and what it assumes of the Sersic index."""
+    estimator, _, prior = name.rpartition("_")
+    return f"{estimator}, {_PRIORS[prior]}"
+
+
 def _made() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(FOLDER / "templates"),
@@ -93,6 +100,7 @@ def _made() -> Environment:
     )
     environment.filters |= {
         "number": number, "signed": signed, "percent": percent, "when": when, "duration": duration,
+        "estimate_name": estimate_name,
     }  # fmt: skip
     environment.globals |= {"version": VERSION}
     return environment

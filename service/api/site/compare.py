@@ -18,7 +18,7 @@ from service.store.result_filter import ResultFilter
 from service.store.result_rows import QUANTITY_UNITS
 from service.web.rendering import page
 
-router = APIRouter(route_class=Route)
+router = APIRouter(include_in_schema=False, route_class=Route)
 _CHOICES = ("grid", *ANALYSES)
 _KNOWN_GRIDS = 200
 _KNOWN = {
@@ -96,4 +96,6 @@ def _figures(by: str, left: str, right: str, names: dict[str, str]) -> list[tupl
     return [
         (names.get(side, side), f"/v1/figures/sample.svg?{urlencode({by: side, 'columns': 1})}")
         for side in (left, right)
+        # Where n is fixed stands beside where it is free in the other one.
+        if (by, side) != ("index_prior", "fixed")
     ]

@@ -11,6 +11,7 @@ from fastapi.responses import RedirectResponse
 
 from engine import GROUPINGS
 from service.api.context import Context, GridId, Service
+from service.api.site.origin import OwnPage
 from service.api.site.questions import (
     DEFAULT_ESTIMATE,
     SHOWN_AXES,
@@ -31,7 +32,7 @@ from service.store.result_rows import QUANTITY_UNITS
 from service.web.biases_map import bias_map
 from service.web.rendering import page
 
-router = APIRouter(route_class=Route)
+router = APIRouter(include_in_schema=False, route_class=Route)
 _ON_A_PAGE = 50
 _MOST_CELLS = 1000
 _MOST_FAILURES = 20
@@ -125,7 +126,9 @@ def progress(grid_id: GridId, service: Service) -> Response:
 
 
 @router.post("/grids/{grid_id}/{action}")
-def act(grid_id: GridId, action: Literal["cancel", "pause", "resume", "retry"], service: Service) -> Response:
+def act(
+    grid_id: GridId, action: Literal["cancel", "pause", "resume", "retry"], service: Service, _own: OwnPage
+) -> Response:
     """Do something to a grid and show it again."""
     actions = {
         "cancel": service.grids.cancel,

@@ -11,7 +11,7 @@ from service.api.threads import Route
 from service.domain.payload import ESTIMATES, RECOMMENDED
 from service.web.rendering import page
 
-router = APIRouter(route_class=Route)
+router = APIRouter(include_in_schema=False, route_class=Route)
 
 
 @router.get("/runs/{run_id}")

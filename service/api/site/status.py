@@ -10,7 +10,7 @@ from service.api.threads import Route, patient
 from service.store.depth import Depth, QueueDepth
 from service.web.rendering import page
 
-router = APIRouter(route_class=Route)
+router = APIRouter(include_in_schema=False, route_class=Route)
 
 
 @router.get("/status")

@@ -27,26 +27,31 @@ from engine import (
 )
 from service.api.context import Context, Service
 from service.api.problems import UnsupportedBodyError
+from service.api.site.origin import OwnPage
 from service.api.threads import PATIENT, Route, run_in
 from service.domain.requests import GridRequest, Plan, TooManyRunsError, plan
 from service.web.form import Field, document_of, field_of, form_fields
 from service.web.rendering import page
 
-router = APIRouter(route_class=Route)
+router = APIRouter(include_in_schema=False, route_class=Route)
 _FORM = "application/x-www-form-urlencoded"
 _SHOWN_LABELS = 24
 _MOST_FIELDS = 100
 _MAIN = ("name", "preset", "systems", "n", "r_eff", "magnitude", "l_eta", "replicates", "seed")
 _CHOICES = {"preset": preset_names}
+_LABELS = {
+    "n": "Sérsic index n", "r_eff": "radius r_eff", "magnitude": "magnitude of the host", "l_eta": "slope l_eta",
+    "mass_model": "mass model",
+}  # fmt: skip
 _HINTS = {
     "name": "what it is called in lists and figures",
     "preset": "a part of the grid of the paper",
     "systems": f"of {', '.join(system_names())}; or a list of objects as JSON",
     "camera": f"instead of the systems' own: {', '.join(camera_names())}; or an object as JSON",
     "mass_model": "of the systems",
-    "n": "Sérsic index",
+    "n": "as 1, 2, 4",
     "r_eff": "half-light radius [arcsec]",
-    "magnitude": "of the host [AB]",
+    "magnitude": "AB",
     "l_eta": "slope of the deflector's mass, less 1",
     "replicates": "realizations of each point",
     "seed": "of the first realization",
@@ -60,7 +65,7 @@ def empty_form() -> Response:
 
 
 @router.post("/submit")
-async def submitted(request: Request, service: Service) -> Response:
+async def submitted(request: Request, service: Service, _own: OwnPage) -> Response:
     """Check what was filled in, or start it and go to its page; the form again where something is wrong."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != _FORM:
@@ -122,7 +127,8 @@ def _fields() -> list[Field]:
         said = "; ".join(filter(None, (_HINTS.get(field.name, ""), field.hint)))
         options = tuple(_CHOICES[field.name]()) if field.name in _CHOICES else field.options
         blank = "none" if field.name in _CHOICES else field.blank
-        found.append(replace(field, hint=said, options=options, blank=blank))
+        label = _LABELS.get(field.name, field.label)
+        found.append(replace(field, label=label, hint=said, options=options, blank=blank))
     order = {name: place for place, name in enumerate(_MAIN)}
     return sorted(found, key=lambda field: order.get(field.name, len(order)))
 
