@@ -91,6 +91,9 @@ async def known_parameters(request: Request) -> None:
     operations = request.app.openapi()["paths"].get(route.path, {})
     documented = operations.get(request.method.lower(), {}).get("parameters", ())
     known = {found["name"]: found["schema"] for found in documented if found["in"] == "query"}
+    if not route.include_in_schema:
+        # A page: it has parameters, and they are in no document.
+        known = {field.alias: {} for field in route.dependant.query_params}
     headers = {found["name"]: found["schema"] for found in documented if found["in"] == "header"}
     for name in request.query_params:
         if name not in known:
@@ -101,7 +104,7 @@ async def known_parameters(request: Request) -> None:
 
 
 def _require_one(source: Literal["query", "header"], name: str, values: list[str], schema: dict[str, Any]) -> None:
-    if len(values) > 1:
+    if len(values) > 1 and schema.get("type") != "array":
         raise InvalidRequestError(source, name, "given more than once")
     kinds = {kind.get("type") for kind in (schema, *schema.get("anyOf", ()))}
     for kind, (pattern, allowed) in _PLAIN.items():

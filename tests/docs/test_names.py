@@ -28,6 +28,11 @@ def _command(words: list[str]) -> tuple[Any, list[str]]:
     return command, words
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_merge_has_left_its_marks(page: Path) -> None:
+    assert not re.search(r"^(<{7}|={7}$|>{7})", page.read_text(), re.MULTILINE)
+
+
 @by_page
 def test_every_command_exists_with_its_options(page: Path) -> None:
     for words in commands(page):
@@ -47,6 +52,13 @@ def test_every_module_that_is_run_exists(page: Path) -> None:
     for words in commands(page):
         if re.fullmatch(r"python[0-9.]*", Path(words[0]).name) and words[1:2] == ["-m"] and len(words) > 2:
             assert find_spec(words[2]) is not None, " ".join(words)
+
+
+@by_page
+def test_every_target_of_make_exists(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    text = "\n".join((*inline_code(page), *(block.text for block in blocks(page) if block.language == "sh")))
+    assert set(re.findall(r"^(?:\$ )?make ([a-z-]+)", text, re.MULTILINE)) <= targets
 
 
 @by_page

@@ -104,7 +104,7 @@ def test_a_surrogate_knows_what_it_was_told_and_nothing_outside_the_prior() -> N
     surrogate = learn_surrogate(known, target.prior, laplace, np.random.RandomState(0))
     points, values = np.array(known.points), np.array(known.values)
     near = values > values.max() - 7.0
-    # It ends its lessons at an error of 0.35 at places that it does not know yet.
+    # It stops learning at an error of 0.35 at places that it does not know yet.
     assert np.abs(surrogate.ln_density(points[near]) - values[near]).max() < 0.35
     assert surrogate.ln_density(np.full((1, 7), 60.0))[0] == -math.inf
     ends, _, _ = surrogate.walk(points[:9], 20, np.random.RandomState(1))

@@ -9,7 +9,7 @@ import pytest
 from engine.errors import InversionError, ObservationError, SpecError
 from engine.imaging.observation import Observation
 from engine.imaging.optics.stamp_matrix import pixel_kernel
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.likelihood.evidence import MAX_CONDITION, invert, ln_evidence
@@ -17,7 +17,7 @@ from engine.likelihood.problem import prepare_problem
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
 from engine.source.lensing_matrix import cast_rays, map_rays
-from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.source.regularisation import SourceModel, sparse_regularisation
 from engine.spec.analysis import Analysis
 from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_likelihood
 from tests.engine.plain_matrices import lensing_matrix, regularisation
@@ -286,7 +286,7 @@ def test_an_empty_mask_is_refused() -> None:
     axis = (np.arange(9) - 4) * 0.1
     nothing = np.zeros((9, 9), dtype=bool)
     with pytest.raises(InversionError, match="mask"):
-        map_rays(cast_rays(nothing, nothing, axis, axis, 0.1, 2), kernel_arguments(LENS), (4, 4))
+        map_rays(cast_rays(nothing, nothing, axis, axis, 0.1, 2), LENS, (4, 4))
 
 
 # Noise
@@ -421,7 +421,7 @@ def test_the_condition_number_is_the_true_one_within_a_factor_of_three(name: str
     """
     model = SourceModel((12, 13), name)  # type: ignore[arg-type]
     inversion = invert(Explicit().likelihood(), LENS, ln_lambda, model)
-    a = inversion.curvature + math.exp(ln_lambda) * regularisation_matrix(model)
+    a = inversion.curvature + math.exp(ln_lambda) * sparse_regularisation(model).toarray()
     true = np.linalg.norm(a, 1) * np.linalg.norm(np.linalg.inv(a), 1)
     # LAPACK's estimate of the norm of the inverse is a lower bound, seldom below a third.
     assert true / 3 < inversion.condition_number < true * 1.001
