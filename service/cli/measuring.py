@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
-from service.cli.outputs import FITS, PICTURES, require_apart, require_file
+from service.cli.outputs import FITS, PICTURES, require_apart, require_file, require_readable
 from service.cli.pictures import refusals
 
 if TYPE_CHECKING:
@@ -59,7 +58,10 @@ def measure(
     for path, kinds in ((json_file, ()), (figure, PICTURES), (fits, FITS)):
         if path is not None:
             require_file(path, kinds)
+    require_readable(path for path in (image, noise, psf, mask) if path is not None)
     with refusals():
+        from rich.console import Console  # noqa: PLC0415 - help needs none
+
         from engine import measure_image  # noqa: PLC0415 - the engine takes seconds to load
 
         observation = _observation(

@@ -1,9 +1,9 @@
-"""Where a command writes: looked at before the work, not after it."""
+"""Files that a command reads and writes: looked at before the work, not after it."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 import typer
@@ -35,6 +35,17 @@ def require_file(path: Path, suffixes: Collection[str] = ()) -> None:
             pass
     except OSError as error:
         raise typer.BadParameter(f"{path}: its folder is not there or cannot be written ({error.strerror})") from None
+
+
+def require_readable(paths: Iterable[Path]) -> None:
+    """Files that are there and can be read; a refusal otherwise, before anything that takes time."""
+    for path in paths:
+        if path.exists() and not path.is_file():
+            raise typer.BadParameter(f"{path}: is not a regular file")
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            raise typer.BadParameter(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def require_apart(outputs: Collection[Path], inputs: Collection[Path] = ()) -> None:

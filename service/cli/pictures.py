@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from service.cli.outputs import PICTURES, require_file, require_folder
 
@@ -192,16 +190,6 @@ def _paper_values(system: str) -> dict[str, float | None]:
     return {"r_eff": min(host.r_eff for host in hosts), "magnitude": sorted({host.magnitude for host in hosts})[1]}
 
 
-def named_or_read(system: str) -> str | dict[str, Any]:
-    """A system for a request: the name as it is, a file as the table that it holds."""
-    if not system.lower().endswith(_FILES):
-        return system
-    with refusals():
-        from engine import read_mapping  # noqa: PLC0415
-
-        return read_mapping(system)
-
-
 def _camera(choice: str | None) -> str | Camera | None:
     if choice is None or not choice.lower().endswith(_FILES):
         return choice
@@ -259,6 +247,16 @@ def _save(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def _progress(what: str, steps: int) -> Iterator[Any]:
+    from rich.console import Console  # noqa: PLC0415 - as the engine
+    from rich.progress import (  # noqa: PLC0415 - as above
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     columns: Sequence[Any] = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
