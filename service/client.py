@@ -72,6 +72,11 @@ class Client:
     ) -> None:
         self._connection = Connection(url, transport, token, retries)
 
+    @property
+    def url(self) -> str:
+        """Address of the service; a password in it is not shown."""
+        return self._connection.url
+
     def __enter__(self) -> Self:
         """Use as a context."""
         return self

@@ -45,7 +45,7 @@ class Connection:
 
     def __init__(self, url: str, transport: httpx.BaseTransport | None, token: str | None, retries: int) -> None:
         _require_address(url)
-        self._url = _without_password(url)
+        self.url = _without_password(url)
         self._retries = retries
         headers = {} if token is None else {"Authorization": f"Bearer {printable('token', token)}"}
         self._http = httpx.Client(
@@ -63,13 +63,13 @@ class Connection:
             return kind.model_validate_json(answer.content)
         except ValidationError:
             said = f"status {answer.status_code}, {answer.headers.get('content-type', 'no content type')}"
-            raise AnswerError(f"what answers at {self._url} is not hostlens as this client knows it: {said}") from None
+            raise AnswerError(f"what answers at {self.url} is not hostlens as this client knows it: {said}") from None
 
     def file(self, address: str) -> bytes:
         """A file that the service gives."""
         answer = self._answer("GET", address)
         if answer.status_code != httpx.codes.OK:
-            raise AnswerError(f"what answers at {self._url} is not hostlens: status {answer.status_code}")
+            raise AnswerError(f"what answers at {self.url} is not hostlens: status {answer.status_code}")
         return answer.content
 
     def _answer(self, method: str, address: str, repeatable: bool = False, **options: Any) -> httpx.Response:

@@ -56,6 +56,7 @@ app = typer.Typer(
     cls=_CommandLine,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its boxes take as long to load as all the rest of the help
     help="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
@@ -141,7 +142,7 @@ def worker(
 def demo(
     data_dir: Annotated[Path, typer.Option(help="Folder of the demo's database and figures")] = Path("var/demo"),
 ) -> None:
-    """Four runs of HE0435-1223 through the whole system; exit code 0 only if all four were stored."""
+    """Four runs of HE0435-1223 through the whole system. Exit code 0 only if all four were stored."""
     from service.cli.demo import demo as run_demo  # noqa: PLC0415 - alembic takes a while, and status needs none
 
     _silence_migrations()
@@ -154,7 +155,7 @@ def check(
         str | None, typer.Option("--database", help="URL of an empty database; a SQLite file of its own without")
     ] = None,
 ) -> None:
-    """See whether this installation keeps its promise: processes are killed, each result is stored once; 2 minutes."""
+    """See whether this installation keeps its promise. Processes are killed, each result is stored once; 2 minutes."""
     from service.cli.check import check as carry_out  # noqa: PLC0415 - loads SQLAlchemy
     from service.runtime import preflight  # noqa: PLC0415 - as above
 

@@ -52,7 +52,8 @@ def connected(url: str | None, token: str | None = None) -> Iterator[Client]:
     from service.client import Client, ClientError, RequestError  # noqa: PLC0415 - as above
 
     try:
-        with Client(settings().url if url is None else url, token=token) as client:
+        # Without repetitions: who sits before a terminal wants to be told at once.
+        with Client(settings().url if url is None else url, token=token, retries=0) as client:
             yield client
     except RequestError as error:
         raise ConfigurationError(str(error)) from error

@@ -126,12 +126,12 @@ def results(
     url: Url = None,
     token: Token = None,
 ) -> None:
-    """How far recovered values are from the truth, by group: mean, scatter, stated errors and whether they hold."""
+    """Biases by group, and whether the stated errors hold."""
     asked: dict[str, Any] = {**_filters(where), "quantity": quantity}
     asked |= {"estimator": estimator} if estimator else {}
     asked |= {"index_prior": index_prior} if index_prior else {}
     with connected(url, token) as client:
-        with console_status("asking"):
+        with _asking():
             found = client.summary(*(grids or []), group_by=group_by, **asked)
         _show(found, style)
 
@@ -143,7 +143,7 @@ def cancel(grid: GridArgument, url: Url = None, token: Token = None) -> None:
 
 
 def pause(grid: GridArgument, url: Url = None, token: Token = None) -> None:
-    """Start no further run of a grid for now; running ones go on to their end."""
+    """Start no further run of a grid for now. Running ones go on to their end."""
     with connected(url, token) as client:
         _tell(client.pause(grid))
 
@@ -164,7 +164,7 @@ def retry(
     url: Url = None,
     token: Token = None,
 ) -> None:
-    """Queue again what failed, was quarantined or was cancelled, or some of it."""
+    """Queue again what ended without a result, or some of it."""
     only = _filters(where)
     if failed:
         if "state" in only:
@@ -208,11 +208,11 @@ def _show(found: SummaryAnswer, style: Format) -> None:
         console().print(bias_table(found))
 
 
-def console_status(what: str) -> Any:
+def _asking() -> Any:
     """A sign on a terminal that something is under way; nothing goes to standard output."""
     from rich.console import Console  # noqa: PLC0415 - as above
 
-    return Console(stderr=True).status(what)
+    return Console(stderr=True).status("asking")
 
 
 def _change(request: dict[str, Any], part: str, given: dict[str, Any]) -> None:

@@ -50,7 +50,7 @@ def measure(
     seed: Annotated[int, typer.Option(min=0, help="Of the chain")] = 0,
     inversion: Annotated[bool, typer.Option(help="Sample the inversion too; without it seconds")] = True,
 ) -> None:
-    """Measure the host galaxy in an image: magnitude, radius, index and their uncertainties."""
+    """Measure the host galaxy in an image. Its magnitude, radius and index, with their uncertainties."""
     if no_agn and (agn_images or positions):
         raise typer.BadParameter("--no-agn: there are --agn-images or --positions as well")
     outputs = [path for path in (json_file, figure, fits) if path is not None]

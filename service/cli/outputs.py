@@ -21,10 +21,15 @@ def require_folder(folder: Path) -> None:
         raise typer.BadParameter(f"{folder}: cannot be written ({error.strerror})") from None
 
 
-def require_file(path: Path, suffixes: Collection[str] = ()) -> None:
-    """A file that can be written, of a kind that its name tells by one of ``suffixes``; a refusal otherwise."""
+def require_kind(path: Path, suffixes: Collection[str]) -> None:
+    """A name that ends in one of ``suffixes``, or any name where there are none; a refusal otherwise."""
     if suffixes and path.suffix.lower() not in suffixes:
         raise typer.BadParameter(f"{path}: allowed is a name that ends in {', '.join(sorted(suffixes))}")
+
+
+def require_file(path: Path, suffixes: Collection[str] = ()) -> None:
+    """A file that can be written, of a kind that its name tells by one of ``suffixes``; a refusal otherwise."""
+    require_kind(path, suffixes)
     if path.is_dir():
         raise typer.BadParameter(f"{path}: is a folder")
     if path.exists() and not path.is_file():
