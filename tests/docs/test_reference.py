@@ -36,3 +36,13 @@ def test_the_picture_of_the_states_has_every_state_and_transition() -> None:
     picture = (ROOT / "docs" / "images" / "states.svg").read_text()
     words = re.findall(r"<text[^>]*>([^<]+)</text>", picture)
     assert set(words) == set(RunState) | set(TRANSITIONS) | {"submit"}
+
+
+def test_every_operation_is_in_the_table_of_the_api() -> None:
+    text = (ROOT / "docs" / "reference" / "api.md").read_text()
+    listed = {re.sub(r"\{\w+\}", "{}", found) for found in re.findall(r"`((?:GET|POST) /[\w/{}.]+)`", text)}
+    paths = json.loads(FILE.read_text())["paths"]
+    operations = {
+        re.sub(r"\{\w+\}", "{}", f"{method.upper()} {path}") for path, methods in paths.items() for method in methods
+    }
+    assert operations <= listed, sorted(operations - listed)
