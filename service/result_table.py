@@ -28,7 +28,7 @@ def as_table(columns: Columns, rows: Sequence[Mapping[str, Any]]) -> QTable:
         values = [row[name] for row in rows]
         missing = [value is None for value in values]
         if name == _TIME:
-            table[name] = Time([_without_zone(value) for value in values] or np.empty(0, "U26"), scale="utc")
+            table[name] = Time([_without_zone(value) for value in values], format="isot", scale="utc")
         elif said["unit"] is not None or any(isinstance(value, float) for value in values):
             numbers = np.array([np.nan if value is None else value for value in values], dtype=float)
             unit = said["unit"]
@@ -45,7 +45,10 @@ def as_frame(columns: Columns, rows: Sequence[Mapping[str, Any]]) -> pd.DataFram
     """A pandas frame; ``attrs`` has the units and descriptions by column."""
     import pandas as pd  # noqa: PLC0415 - optional
 
-    frame = pd.DataFrame(list(rows), columns=list(columns)).convert_dtypes(convert_floating=False)
+    frame = pd.DataFrame(list(rows), columns=list(columns))
+    for name in columns:
+        if {type(row[name]) for row in rows} == {int, type(None)}:
+            frame[name] = frame[name].astype("Int64")  # or pandas makes numbers with a fraction of them
     frame[_TIME] = pd.to_datetime(frame[_TIME], utc=True, format="ISO8601")
     for part in ("unit", "description"):
         frame.attrs[f"{part}s"] = {name: said[part] for name, said in columns.items() if said[part] is not None}

@@ -135,8 +135,8 @@ class TestGrids:
         newest = client.grids(limit=1).items[0].id
         assert client.dry_run(BODY, replicates=2).n_runs == 16
         assert client.grids(limit=1).items[0].id == newest
-        again = client.submit(preset="h0licow-vi/HE0435", n=[2], magnitude=[20.5], key="the same")
-        same = client.submit(preset="h0licow-vi/HE0435", n=[2], magnitude=[20.5], key="the same")
+        again = client.submit(preset="h0licow-vi/HE0435", n=[2], magnitude=[20.5], key="the-same")
+        same = client.submit(preset="h0licow-vi/HE0435", n=[2], magnitude=[20.5], key="the-same")
         assert again.id == same.id
         client.wait(again.id, timeout_s=300)
 
@@ -232,7 +232,7 @@ class TestCommands:
             "n": [2.0], "r_eff": [0.35], "magnitude": [21.0], "l_eta": [1.0], "seed": 7, "replicates": 2,
             "camera": "WFC3-IR_F160W", "mass_model": "recommended", "noise_level": "handbook",
             "optics": {"defocus_nm": 3.0, "jitter": 0.004}, "name": "all of them",
-            "analysis": {"profile": "draft", "estimators": ["image", "paper"], "draws": 12,
+            "analysis": {"profile": "draft", "estimators": ["paper", "image"], "draws": 12,
                          "regularisation": "gradient"},
         }  # fmt: skip
         schema = client_schema(client)
