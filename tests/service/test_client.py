@@ -126,7 +126,7 @@ class TestAnswers:
         run = next(client.runs(grid.id, state="done"))
         assert client.run_figure(run.id).startswith(b"\x89PNG")
         with pytest.raises(ApiError) as refused:
-            client.run_figure("r_" + "0" * 26)
+            client.run_figure(f"{run.id[:-7]}9999999")
         assert refused.value.status == 404
 
 
