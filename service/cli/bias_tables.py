@@ -15,31 +15,56 @@ _NAMES = {"magnitude": "mag", "r_eff": "R_eff", "noise_treatment": "noise", "reg
           "configuration": "config.", "noise_level": "noise level"}  # fmt: skip
 
 
+_NUMBERS = ("runs", "bias +- error", "rmse", "sd", "68 %", "95 %", "failed")
+
+
 def bias_table(found: SummaryAnswer) -> Table:
-    """A line for each group; bias with its own error, scatter, what the runs state, and whether that holds."""
+    """A line for each group; bias with its own error, scatter, what the runs state, and whether that holds.
+
+    What all groups share is said once, above them.
+    """
     question = found.question
-    title = f"Bias of {question.quantity}" + ("" if question.unit is None else f" [{question.unit}]")
-    recommended = ", recommended" if question.recommended else ""
-    title += f" by {question.estimator}, n {question.index_prior}{recommended}"
-    table = Table(title=title, box=box.SIMPLE, pad_edge=False, title_justify="left", caption_justify="left")
-    for axis in question.group_by:
-        table.add_column(_NAMES.get(axis, axis), overflow="fold")
-    for name in ("runs", "bias +- error", "rmse", "stated sd", "68 %", "95 %", "failed"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for row in found.rows:
-        group = [_value(row.group[axis]) for axis in question.group_by]
-        table.add_row(*group, *_numbers(row), str(row.failed) if row.failed else "")
+    axes = [axis for axis in question.group_by if len({row.group[axis] for row in found.rows}) != 1]
+    table = Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title_justify="left", caption_justify="left"
+    )
+    table.title = _title(found, [axis for axis in question.group_by if axis not in axes])
+    lines = [[*(_value(row.group[axis]) for axis in axes), *_numbers(row), str(row.failed or "")] for row in found.rows]
+    names = [*(_NAMES.get(axis, axis) for axis in axes), *_NUMBERS]
+    for place, name in enumerate(names):
+        longest = max(len(name), *(len(line[place]) for line in lines), 0)
+        is_text = place < len(axes) and any(isinstance(row.group[axes[place]], str) for row in found.rows)
+        # Where it is too wide a name gives way, and no number.
+        table.add_column(
+            name,
+            justify="left" if is_text else "right",
+            no_wrap=not is_text,
+            overflow="ellipsis",
+            min_width=None if is_text else longest,
+        )
+    for line in lines:
+        table.add_row(*line)
     table.caption = (
-        "bias: recovered minus true; rmse, stated sd: of one run; 68 %, 95 %: part of the runs whose stated interval "
-        "holds the truth" + (f"; {found.failed_elsewhere} failed in other groups" if found.failed_elsewhere else "")
+        "bias: recovered minus true; rmse: of one run; sd: as the runs state it; 68 and 95 %: part of the runs whose "
+        "interval holds the truth"
+        + (f"; {found.failed_elsewhere} failed in other groups" if found.failed_elsewhere else "")
     )
     return table
+
+
+def _title(found: SummaryAnswer, shared: list[str]) -> str:
+    question = found.question
+    title = f"Bias of {question.quantity}" + ("" if question.unit is None else f" ({question.unit})")
+    title += f" by {question.estimator}, n {question.index_prior}"
+    title += " (recommended)" if question.recommended else ""
+    told = [f"{axis} = {_value(found.rows[0].group[axis])}" for axis in shared]
+    return "\n".join([title, *([", ".join(told)] if told else [])])
 
 
 def _numbers(row: GroupView) -> list[str]:
     bias = row.bias
     if bias is None:
-        return [f"0/{row.stored}", "", "", "", "", ""]
+        return [f"0/{row.stored}", *[""] * 5]
     runs = str(bias.runs) if bias.runs == row.stored else f"{bias.runs}/{row.stored}"
     error = "" if bias.standard_error is None else f" +- {bias.standard_error:.3f}"
     shares = [f"{100 * bias.coverage[level].fraction:.0f}" for level in sorted(bias.coverage)]
