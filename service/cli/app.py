@@ -16,6 +16,7 @@ from service.cli import grids, pictures
 from service.cli.connection import FailedError, console
 from service.cli.connection import settings as _settings
 from service.cli.measuring import measure
+from service.cli.replay import replay
 from service.runtime.start import CONFIGURATION, ConfigurationError
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, measure):
+for command in (*grids.COMMANDS, *pictures.COMMANDS, measure, replay):
     app.command()(command)
 
 
