@@ -22,7 +22,9 @@ def one_run(request: Request, run_id: RunId, service: Service) -> Response:
     result = run["result"]
     names = sorted(ESTIMATES, key=lambda name: name != RECOMMENDED)
     found = {} if result is None else result["estimates"]
-    provenance = [("Realization", run["digest"]), ("Seed", str(run["inputs"]["seed"]))]
+    # An image that somebody has measured has no inputs.
+    seed = run["inputs"].get("seed")
+    provenance = [("Realization", run["digest"]), *([] if seed is None else [("Seed", str(seed))])]
     if run["paper_run"] is not None:
         provenance.insert(0, ("Serial number in Table 3", str(run["paper_run"])))
     if result is not None:
