@@ -10,7 +10,19 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
 
 from service import VERSION
-from service.api import catalogue, downloads, events, figures, grids, health, problems, results, site
+from service.api import (
+    catalogue,
+    downloads,
+    events,
+    exports,
+    figures,
+    grids,
+    health,
+    problems,
+    results,
+    run_files,
+    site,
+)
 from service.api.context import Context, bind_ids
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
@@ -83,7 +95,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
     figures.install(app)
-    for room in (grids, figures, results, events, catalogue, health):
+    for room in (grids, run_files, figures, results, exports, events, catalogue, health):
         app.include_router(room.router)
     site.install(app)
     return app
