@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Kind = Literal["text", "number", "integer", "boolean", "list", "json"]
+_UNBOUNDED = 1e9
 _SCALARS: dict[str, Kind] = {"string": "text", "number": "number", "integer": "integer", "boolean": "boolean"}
 
 
@@ -118,12 +119,10 @@ def _range(schema: Mapping[str, Any]) -> str:
     whole = "whole number" if schema.get("type") == "integer" else ""
     if low is None and high is None:
         return whole
-    bounds = (
-        f"{low:g} to {high:.6g}"
-        if high is not None and low is not None
-        else f"from {low if low is not None else high:g}"
-    )
-    return f"{whole} {bounds}".strip()
+    # What a number may be at all is no bound to tell of.
+    ends = [end for end in (low, high) if end is not None and abs(end) < _UNBOUNDED]
+    told = " to ".join(f"{end:g}" for end in ends) if len(ends) != 1 else f"from {ends[0]:g}"
+    return f"{whole} {told}".strip()
 
 
 def _value(kind: Kind, items: Kind, text: str, read_json: Callable[[str], Any]) -> Any:
