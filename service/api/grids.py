@@ -16,11 +16,12 @@ from service.api.context import GridId, Limit, RunId, Service
 from service.api.downloads import artefact
 from service.api.links import link_document, link_grid, link_grids, link_runs
 from service.api.pages import next_link
+from service.api.retries import RetryRequest
 from service.api.threads import patient
 from service.domain.identifiers import GRID_PATTERN
 from service.domain.requests import GridRequest, plan
 from service.domain.states import RunState
-from service.domain.views import DryRun, GridPage, GridView, RunDetail, RunPage, Summary
+from service.domain.views import DryRun, GridPage, GridView, RetriedGrid, RunDetail, RunPage, Summary
 from service.store.grids import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
@@ -134,10 +135,14 @@ def resume(grid_id: GridId, service: Service) -> GridView:
 
 
 @router.post("/grids/{grid_id}/retry")
-def retry(grid_id: GridId, service: Service) -> GridView:
-    """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts."""
-    service.grids.revive(grid_id)
-    return link_grid(service.grids.grid(grid_id))
+def retry(grid_id: GridId, service: Service, body: RetryRequest | None = None) -> RetriedGrid:
+    """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts.
+
+    Or, with a body, those of them that it picks.
+    """
+    retried = service.grids.revive(grid_id, None if body is None else body.wanted())
+    grid = link_grid(service.grids.grid(grid_id))
+    return RetriedGrid(**dict(grid), retried=retried)
 
 
 @router.get("/runs/{run_id}", response_model=RunDetail)

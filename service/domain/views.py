@@ -95,6 +95,13 @@ class GridView(_Answer):
     links: Links
 
 
+class RetriedGrid(GridView):
+    """A grid some of whose runs have been queued again."""
+
+    retried: int
+    """How many; in a grid that is paused they wait with the others."""
+
+
 class GridPage(_Answer):
     """A page of grids, newest first."""
 

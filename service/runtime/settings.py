@@ -30,7 +30,7 @@ from service.runtime.setting_types import (
 from service.runtime.start import ConfigurationError
 
 _PREFIX = "HOSTLENS_"
-OTHERS = frozenset({"HOSTLENS_URL", PARENT_FD, LISTENER_FD, API_NUMBER})
+OTHERS = frozenset({"HOSTLENS_URL", "HOSTLENS_TOKEN", PARENT_FD, LISTENER_FD, API_NUMBER})
 """Variables that are no settings: of the command line's client, of the supervisor for its children."""
 DEPLOYMENT = frozenset(
     f"HOSTLENS_{name}" for name in ("DB_PASSWORD", "TAG", "SHARED", "SCHEDULER_HOST", "SCHEDULER_PORT")
@@ -245,5 +245,5 @@ def _require_known(settings: frozenset[str]) -> None:
             near = get_close_matches(name, known, 1, 0.75)
             hint = f": did you mean {near[0]}?" if near else "; docs/reference/settings.md lists them"
             raise ValueError(f"{variable} is not a setting of hostlens{hint}")
-        if name in settings | {"HOSTLENS_URL"} and not value.strip():
+        if name in settings | {"HOSTLENS_URL", "HOSTLENS_TOKEN"} and not value.strip():
             raise ValueError(f"{variable} is empty: give it a value, or unset it for the default")
