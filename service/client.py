@@ -208,9 +208,13 @@ class Client:
 
         return as_frame(*self._whole(grid_ids, asked))
 
-    def figure(self, grid_id: str, name: str = "bias", kind: str = "svg") -> bytes:
-        """A figure of a grid as an SVG or PNG file: bias, sample, coverage, pull, trends or montage."""
-        return self._connection.file(f"/v1/grids/{_part(grid_id)}/figures/{_part(name)}.{_part(kind)}")
+    def figure(self, grid_id: str, name: str = "bias", kind: str = "svg", **asked: Filter) -> bytes:
+        """A figure of a grid as an SVG or PNG file: bias, sample, coverage, pull, trends or montage.
+
+        ``asked`` is as in :meth:`summary`, and ``by``, ``columns``, ``limits``; a bias figure is of one ``system``.
+        """
+        path = f"/v1/grids/{_part(grid_id)}/figures/{_part(name)}.{_part(kind)}"
+        return self._connection.file(_address(path, (), asked) if asked else path)
 
     def run_figure(self, run_id: str) -> bytes:
         """The figure of a run, a PNG file: observation, model, residual, source."""

@@ -3,38 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.cli.connection import FailedError, Token, Url, connected
+from service.cli.outputs import require_folder
 
 if TYPE_CHECKING:
     from service.client import Client
 
-OF_GRID = ("sample", "trends", "coverage", "pull", "montage")
+_OF_GRID = ("sample", "trends", "coverage", "pull", "montage")
 _NOTHING = 404
 
 
-def write_figures(client: Client, grid_id: str, folder: Path, kind: str) -> Iterator[Path]:
-    """Write the bias figure of each system and the others of the grid; the files, as they come.
+class FigureFormat(StrEnum):
+    """How figures are written."""
 
-    A figure that has nothing to show yet is left out.
-    """
-    systems = sorted({str(run.inputs["system"]) for run in client.runs(grid_id)})
-    wanted = [(f"bias_{system}", "bias", {"system": system}) for system in systems]
-    wanted += [(name, name, {}) for name in OF_GRID]
-    for file, name, asked in wanted:
-        data = _figure(client, grid_id, name, kind, asked)
-        if data is not None:
-            path = folder / f"{file}.{kind}"
+    SVG = "svg"
+    PNG = "png"
+
+
+def figures(
+    grid: Annotated[str, typer.Argument(help="Its id")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder")] = Path(),
+    kind: Annotated[FigureFormat, typer.Option("--format", help="Of the files")] = FigureFormat.SVG,
+    url: Url = None,
+    token: Token = None,
+) -> None:
+    """Write the figures of a grid: biases of each system, sample, trends, coverage, pulls, montage."""
+    require_folder(output)
+    with connected(url, token) as client:
+        written = 0
+        for name, data in _drawn(client, grid, kind):
+            path = output / f"{name}.{kind}"
             path.write_bytes(data)
-            yield path
+            typer.echo(path)
+            written += 1
+        if not written:
+            raise FailedError(f"grid {grid} has no result yet that a figure could show")
 
 
-def _figure(client: Client, grid_id: str, name: str, kind: str, asked: dict[str, str]) -> bytes | None:
-    from service.client import ApiError  # noqa: PLC0415 - loads httpx, which help needs not
+def _drawn(client: Client, grid_id: str, kind: str) -> Iterator[tuple[str, bytes]]:
+    """Each figure that has something to show, as it comes."""
+    from service.client import ApiError  # noqa: PLC0415 - what a command needs it loads itself
 
-    try:
-        return client.figure(grid_id, name, kind, **asked)
-    except ApiError as error:
-        if error.status == _NOTHING:
-            return None
-        raise
+    client.status(grid_id)
+    systems = [str(row.group["system"]) for row in client.summary(grid_id, group_by="system").rows]
+    wanted = [(f"bias_{system}", "bias", {"system": system}) for system in systems]
+    for name, figure, asked in (*wanted, *((name, name, {}) for name in _OF_GRID)):
+        try:
+            yield name, client.figure(grid_id, figure, kind, **asked)
+        except ApiError as error:
+            if error.status != _NOTHING:
+                raise
