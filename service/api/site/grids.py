@@ -137,7 +137,7 @@ def act(
         "cancel": service.grids.cancel,
         "pause": service.grids.pause,
         "resume": service.grids.resume,
-        "retry": lambda grid_id: service.grids.revive(grid_id),  # with its defaults
+        "retry": service.grids.revive,
     }
     actions[action](grid_id)
     return RedirectResponse(f"/grids/{grid_id}", 303, {"Cache-Control": "no-store"})
