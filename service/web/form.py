@@ -23,6 +23,8 @@ class Field:
     options: tuple[str, ...] = ()
     items: Kind = "text"
     """What a list holds."""
+    is_long: bool = False
+    """It may hold an object of one's own."""
     value: str = ""
     error: str = ""
 
@@ -85,7 +87,21 @@ def _field(path: str, name: str, schema: Mapping[str, Any], default: Any) -> Fie
     blank = "" if default is None else str(default)
     if options:
         blank = f"default: {default}" if default is not None else "default"
-    return Field(path, name.replace("_", " "), kind, _hint(kind, schema), blank, options, items)
+    return Field(
+        path,
+        name.replace("_", " "),
+        kind,
+        _hint(kind, schema),
+        blank,
+        options,
+        items,
+        kind == "json" or _has_object(schema),
+    )
+
+
+def _has_object(schema: Mapping[str, Any]) -> bool:
+    choices = schema.get("items", schema).get("oneOf", ())
+    return any("$ref" in choice for choice in choices)
 
 
 def _kind(schema: Mapping[str, Any]) -> tuple[Kind, Kind]:
@@ -127,7 +143,8 @@ def _range(schema: Mapping[str, Any]) -> str:
 
 def _value(kind: Kind, items: Kind, text: str, read_json: Callable[[str], Any]) -> Any:
     if kind == "json" or text.startswith(("{", "[")):
-        return read_json(text)
+        value = read_json(text)
+        return [value] if kind == "list" and isinstance(value, dict) else value
     if kind == "list":
         return [_scalar(items, part.strip()) for part in text.split(",") if part.strip()]
     return _scalar(kind, text)

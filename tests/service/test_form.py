@@ -44,6 +44,14 @@ def test_what_is_typed_becomes_the_document_that_the_api_takes() -> None:
     }  # fmt: skip
 
 
+def test_an_object_alone_is_a_list_of_one_where_a_list_is_wanted() -> None:
+    assert FIELDS["systems"].is_long
+    assert FIELDS["camera"].is_long
+    assert not FIELDS["n"].is_long
+    document, _ = document_of(FIELDS.values(), {"systems": '{"name": "mine"}', "camera": '{"name": "c"}'}, json.loads)
+    assert document == {"systems": [{"name": "mine"}], "camera": {"name": "c"}}
+
+
 def test_what_is_no_number_stays_for_the_model_to_refuse_and_what_is_no_json_is_told() -> None:
     document, wrong = document_of(FIELDS.values(), {"seed": "many", "optics": "{"}, json.loads)
     assert document == {"seed": "many"}

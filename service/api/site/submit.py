@@ -47,8 +47,8 @@ _LABELS = {
 _HINTS = {
     "name": "what it is called in lists and figures",
     "preset": "a part of the grid of the paper",
-    "systems": f"of {', '.join(system_names())}; or a list of objects as JSON",
-    "camera": f"instead of the systems' own: {', '.join(camera_names())}; or an object as JSON",
+    "systems": f"of {', '.join(system_names())}; or a system of your own as JSON",
+    "camera": f"instead of the systems' own: {', '.join(camera_names())}; or a camera of your own as JSON",
     "mass_model": "of the systems",
     "n": "as 1, 2, 4",
     "r_eff": "half-light radius [arcsec]",
