@@ -10,8 +10,9 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
 
 from service import VERSION
-from service.api import catalogue, downloads, events, grids, health, problems
+from service.api import catalogue, downloads, events, grids, health, login, problems
 from service.api.context import Context, bind_ids
+from service.api.gate import COOKIE, Gate
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
 from service.api.metrics import Measured
@@ -22,6 +23,13 @@ from service.runtime.settings import Settings
 _PROBLEM: dict[str, Any] = {
     "description": "A problem (RFC 9457)",
     "content": {problems.MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+}
+
+
+# Neither where the service listens on loopback: it asks for no token there unless told to.
+_SECURITY: dict[str, Any] = {
+    "token": {"type": "http", "scheme": "bearer", "description": "As hostlens token create makes it"},
+    "cookie": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "For pages: set by POST /login"},
 }
 
 
@@ -39,6 +47,8 @@ class _App(FastAPI):
             schemas |= schemas["Problem"].pop("$defs", {})
             schemas.pop("HTTPValidationError", None)
             schemas.pop("ValidationError", None)
+            document["components"]["securitySchemes"] = _SECURITY
+            document["security"] = [{}, *({name: []} for name in _SECURITY)]
             for operations in document["paths"].values():
                 for operation in operations.values():
                     operation["responses"].pop("422", None)
@@ -76,12 +86,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.context = context
     app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes)
+    # Before the body is read: who may not come in sends none.
+    app.add_middleware(Gate, tokens=context.tokens if context.settings.asks_for_tokens else None)
     app.add_middleware(Head)
     # Last added is outermost: refused bodies are requests too.
     app.add_middleware(Measured, metrics=context.metrics)
     problems.install(app)
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
-    for room in (grids, events, catalogue, health):
+    for room in (grids, events, catalogue, health, login):
         app.include_router(room.router)
     return app

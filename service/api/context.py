@@ -16,6 +16,7 @@ from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.outbox import EventStore
+from service.store.tokens import TokenStore
 
 _IDS = frozenset({"grid_id", "run_id"})
 
@@ -28,6 +29,7 @@ class Context:
         self.database = Database(settings.database)
         self.grids = GridStore(self.database)
         self.events = EventStore(self.database)
+        self.tokens = TokenStore(self.database)
         self.hub = Hub(self.events, settings.max_streams)
         # A connection of their own each time, or probes would queue behind whoever waits for the database already.
         self.probed = Database(settings.database, pooled=False)

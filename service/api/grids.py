@@ -12,11 +12,13 @@ from pydantic_core import to_json
 
 from engine import engine_digest
 from service.api.bodies import JsonRoute
-from service.api.context import GridId, Limit, RunId, Service
+from service.api.context import Context, GridId, Limit, RunId, Service
 from service.api.downloads import artefact
+from service.api.gate import Asking
 from service.api.links import link_document, link_grid, link_grids, link_runs
 from service.api.pages import next_link
 from service.api.threads import patient
+from service.domain.access import ANYBODY, Caller
 from service.domain.identifiers import GRID_PATTERN
 from service.domain.requests import GridRequest, plan
 from service.domain.states import RunState
@@ -41,7 +43,7 @@ _SHOWN_LABELS = 100
     responses={200: {"model": DryRun, "description": "What a dry run would start"}},
 )
 def submit(
-    body: GridRequest, service: Service, dry_run: bool = False, idempotency_key: IdempotencyKey = None
+    body: GridRequest, service: Service, caller: Asking, dry_run: bool = False, idempotency_key: IdempotencyKey = None
 ) -> JSONResponse:
     """Accept a grid: once this answers 202 its runs are in the database. ``dry_run`` only checks."""
     if dry_run:
@@ -54,6 +56,7 @@ def submit(
         body.name,
         idempotency_key,
         engine_digest(),
+        caller.name,
     )
     _LOG.info("replayed" if made.replayed else "accepted", extra={"grid": made.grid.id, "runs": made.grid.n_runs})
     grid = link_grid(made.grid)
@@ -116,28 +119,37 @@ def _written(document: Any, headers: dict[str, str] | None = None) -> Response:
 
 
 @router.post("/grids/{grid_id}/cancel")
-def cancel(grid_id: GridId, service: Service) -> GridView:
+def cancel(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Cancel a grid: queued runs at once, running ones as soon as the dispatcher sees it."""
+    _require_owner(caller, grid_id, service)
     return link_grid(service.grids.cancel(grid_id))
 
 
 @router.post("/grids/{grid_id}/pause")
-def pause(grid_id: GridId, service: Service) -> GridView:
+def pause(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Pause a grid: no queued run is started any more; running ones end as they would."""
+    _require_owner(caller, grid_id, service)
     return link_grid(service.grids.pause(grid_id))
 
 
 @router.post("/grids/{grid_id}/resume")
-def resume(grid_id: GridId, service: Service) -> GridView:
+def resume(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Resume a paused grid."""
+    _require_owner(caller, grid_id, service)
     return link_grid(service.grids.resume(grid_id))
 
 
 @router.post("/grids/{grid_id}/retry")
-def retry(grid_id: GridId, service: Service) -> GridView:
+def retry(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts."""
+    _require_owner(caller, grid_id, service)
     service.grids.revive(grid_id)
     return link_grid(service.grids.grid(grid_id))
+
+
+def _require_owner(caller: Caller, grid_id: str, service: Context) -> None:
+    if caller is not ANYBODY:
+        caller.require_owner(service.grids.owner(grid_id), f"grid {grid_id}")
 
 
 @router.get("/runs/{run_id}", response_model=RunDetail)

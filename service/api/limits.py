@@ -91,6 +91,9 @@ async def known_parameters(request: Request) -> None:
     operations = request.app.openapi()["paths"].get(route.path, {})
     documented = operations.get(request.method.lower(), {}).get("parameters", ())
     known = {found["name"]: found["schema"] for found in documented if found["in"] == "query"}
+    if not route.include_in_schema:
+        # A page: it has parameters, and they are in no document.
+        known = {field.alias: {} for field in route.dependant.query_params}
     headers = {found["name"]: found["schema"] for found in documented if found["in"] == "header"}
     for name in request.query_params:
         if name not in known:

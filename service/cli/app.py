@@ -16,6 +16,7 @@ from service import VERSION
 from service.cli.measuring import measure
 from service.cli.pictures import COMMANDS, named_or_read
 from service.cli.request_file import read_request
+from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
+app.add_typer(tokens, name="token")
 for command in (*COMMANDS, measure):
     app.command()(command)
 

@@ -91,6 +91,8 @@ class GridView(_Answer):
     paused_at: datetime | None
     engine_digest: str | None
     """Of the engine whose results the grid takes: the one that was installed where it was submitted."""
+    owner: str | None
+    """Name of the token that it was submitted with, who may cancel and retry it; null where none was asked for."""
     request: dict[str, Any]
     links: Links
 

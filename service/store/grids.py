@@ -101,12 +101,14 @@ class GridStore:
         name: str | None = None,
         key: str | None = None,
         engine: str | None = None,
+        owner: str | None = None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
         After a crash there is the whole grid or none of it: what has been stored in part nobody sees, and it is gone on
         with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
-        ``engine`` is the digest of the engine whose results the grid takes, any where None.
+        ``engine`` is the digest of the engine whose results the grid takes, any where None; a key is its
+        ``owner``'s: of another one it is another request.
 
         Raises
         ------
@@ -115,7 +117,8 @@ class GridStore:
         SubmissionLostError
             Storing took so long that the grid was given up.
         """
-        canonical = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+        asked = request if owner is None else [owner, request]
+        canonical = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
         known = self._by_key(key, canonical)
         if known is not None and not known.storing:
             return Created(self.grid(known.id), replayed=True)
@@ -125,7 +128,7 @@ class GridStore:
             with self._database.write() as connection:
                 give_up(connection, known.id, self._clock())
             known = None
-        new = Submission(request, canonical, name, key, engine, self._clock())
+        new = Submission(request, canonical, name, key, engine, self._clock(), owner)
         if known is None:
             try:
                 return Created(self.grid(store(self._database, new, runs)), replayed=False)
@@ -194,6 +197,15 @@ class GridStore:
             estimates = [] if found is None else connection.execute(_ESTIMATES, parameters).all()
             attempts = connection.execute(_ATTEMPTS, parameters).all()
         return run_document(row, found, estimates, attempts)
+
+    def owner(self, grid_id: str) -> str | None:
+        """Whose grid it is; a NotFoundError where there is none."""
+        with self._database.read() as connection:
+            row = connection.execute(select(grid.c.owner).where(grid.c.id == grid_id, WHOLE)).one_or_none()
+        if row is None:
+            raise NotFoundError(f"there is no grid {grid_id}")
+        owner: str | None = row.owner
+        return owner
 
     def cancel(self, grid_id: str) -> GridView:
         """Mark the grid, so that nothing of it is started and the dispatcher stops what is running; end what is queued.

@@ -75,6 +75,7 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         cancelled_at=row.cancelled_at,
         paused_at=row.paused_at,
         engine_digest=row.engine_digest,
+        owner=row.owner,
         request=row.request,
         links={},
     )

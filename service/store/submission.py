@@ -40,6 +40,7 @@ class Submission:
     key: str | None
     engine: str | None
     created_at: datetime
+    owner: str | None = None
 
 
 def store(database: Database, submission: Submission, plan: Plan, begun: str | None = None) -> str:
@@ -95,6 +96,7 @@ def _begin(connection: Connection, grid_id: str, submission: Submission, n_runs:
             state=GridState.QUEUED,
             created_at=submission.created_at,
             engine_digest=submission.engine,
+            owner=submission.owner,
             storing=True,
         )
     )
