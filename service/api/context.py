@@ -12,6 +12,7 @@ from service.domain.identifiers import GRID_PATTERN, RUN_PATTERN
 from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
+from service.store.costs import CostStore
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
@@ -28,6 +29,7 @@ class Context:
         self.settings = settings
         self.database = Database(settings.database)
         self.grids = GridStore(self.database)
+        self.costs = CostStore(self.database)
         self.events = EventStore(self.database)
         self.tokens = TokenStore(self.database)
         self.hub = Hub(self.events, settings.max_streams)

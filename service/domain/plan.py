@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
+
+
+class Kind(NamedTuple):
+    """What the time that a run takes depends on most."""
+
+    camera: str
+    configuration: str
+    profile: str
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.domain.views import GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
+from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent, recent_of
 from service.store.pieces import Turns
@@ -102,13 +103,15 @@ class GridStore:
         key: str | None = None,
         engine: str | None = None,
         owner: str | None = None,
+        expected_wall_s: Callable[[], float | None] = lambda: None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
         After a crash there is the whole grid or none of it: what has been stored in part nobody sees, and it is gone on
         with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
         ``engine`` is the digest of the engine whose results the grid takes, any where None; a key is its
-        ``owner``'s: of another one it is another request.
+        ``owner``'s: of another one it is another request. ``expected_wall_s`` is what its runs should take on one
+        worker, asked as ``plan`` is.
 
         Raises
         ------
@@ -130,6 +133,7 @@ class GridStore:
             known = None
         new = Submission(request, canonical, name, key, engine, self._clock(), owner)
         if known is None:
+            new = replace(new, expected_wall_s=expected_wall_s())
             try:
                 return Created(self.grid(store(self._database, new, runs)), replayed=False)
             except IntegrityError:
@@ -300,7 +304,9 @@ class GridStore:
         if row.ending is not None:
             return ended_grid_view(row)
         counts = {str(state): row._mapping[f"{state}_runs"] for state in RunState}
-        return grid_view(row, counts, recent_of(connection, grid_id), self._clock())
+        latest = recent_of(connection, grid_id)
+        workers = _workers(connection) if latest is None and row.expected_wall_s is not None else 0
+        return grid_view(row, counts, latest, self._clock(), workers)
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()
@@ -310,8 +316,9 @@ class GridStore:
         for row in connection.execute(_COUNTS, {"ids": ids}) if ids else ():
             counts[row.grid_id][row.state] = row.runs
         latest = recent(connection, ids) if ids else {}
+        workers = _workers(connection) if len(latest) < len(ids) else 0
         return [
-            grid_view(row, counts[row.id], latest.get(row.id), now) if row.ending is None else ended_grid_view(row)
+            grid_view(row, counts[row.id], latest.get(row.id), now, workers) if row.ending is None else ended_grid_view(row)
             for row in rows
         ]
 
@@ -319,6 +326,11 @@ class GridStore:
     def _require(connection: Connection, grid_id: str) -> None:
         if connection.scalar(select(grid.c.id).where(grid.c.id == grid_id, WHOLE)) is None:
             raise NotFoundError(f"there is no grid {grid_id}")
+
+
+def _workers(connection: Connection) -> int:
+    leader = leader_view(connection)
+    return 0 if leader is None else leader.workers
 
 
 def _count(connection: Connection, grid_id: str, states: Collection[RunState]) -> int:

@@ -146,6 +146,10 @@ class RunQueue:
         with self._database.write() as connection:
             require_generation(connection, generation)
             rows = connection.execute(taken).all()
+            if rows:
+                # Without the lock of its grid, which nobody may wait for who holds runs.
+                started = [new_event(row.grid_id, "run_started", now, row.id, attempt=row.attempt) for row in rows]
+                add_events(connection, started)
         leases = []
         for row in sorted(rows, key=lambda row: (row.not_before, row.id)):
             spec = _read_spec(row.spec)

@@ -44,8 +44,13 @@ def ended_grid_view(row: Row[Any]) -> GridView:
     return _grid_view(row, RunCounts(**row.ending["counts"]), GridState(row.state), row.ending["rate_per_s"], 0.0)
 
 
-def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
-    """A grid with its progress; an unfinished one that is not paused is running once a run has been started."""
+def grid_view(
+    row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime, workers: int = 0
+) -> GridView:
+    """A grid with its progress; an unfinished one that is not paused is running once a run has been started.
+
+    ``workers`` that there are now: before the first run has ended the time left is reckoned by what runs of its kind took.
+    """
     runs = RunCounts(**counts)
     state = GridState(row.state)
     if state is GridState.QUEUED and row.paused_at is not None:
@@ -54,6 +59,8 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
         state = GridState.RUNNING
     remaining = runs.queued + runs.paused + runs.leased
     rate, left = _pace(recent, remaining, now)
+    if left is None and workers and row.expected_wall_s is not None:
+        left = row.expected_wall_s * remaining / row.n_runs / min(workers, remaining)
     if state is GridState.PAUSED:
         left = None
     return _grid_view(row, runs, state, rate, left)
