@@ -59,6 +59,7 @@ def summary_of(realization: Realization) -> dict[str, Any]:
     }
     try:
         result = run(realization)
+        assert result.chain is not None
     except EngineError as error:
         return {**record, "error": str(error), "seconds": time.perf_counter() - began}
     estimates = {

@@ -26,7 +26,7 @@ from benchmarks.timing import in_turns, least
 from engine.conventions import FloatArray, pixel_centres
 from engine.imaging.observation import Observation
 from engine.imaging.optics.stamp_matrix import blurring_matrix, central_stamp
-from engine.lensing.power_law import PowerLawLens, deflection, kernel_arguments
+from engine.lensing.power_law import PowerLawLens, deflection
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.likelihood.evidence import ln_evidence
 from engine.likelihood.problem import Problem, prepare_problem
@@ -37,7 +37,7 @@ from engine.simulation.scene import build_scene
 from engine.simulation.simulate import simulate
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, cast_rays, map_rays
-from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.source.regularisation import SourceModel, sparse_regularisation
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
@@ -47,11 +47,11 @@ def dense_ln_evidence(
     likelihood: MarginalLikelihood, lens: PowerLawLens, ln_lambda: float, model: SourceModel
 ) -> float:
     """The same number from explicit matrices, amplitudes as extra columns."""
-    mapping = map_rays(likelihood.rays, kernel_arguments(lens), model.shape)
+    mapping = map_rays(likelihood.rays, lens, model.shape)
     white = likelihood.whitened
     g = np.hstack([white.noise.whiten(likelihood.blurring @ mapping.dense()), white.columns])
     n, k = model.shape[0] * model.shape[1], white.columns.shape[1]
-    h = regularisation_matrix(model)
+    h = sparse_regularisation(model).toarray()
     a = g.T @ g
     a[:n, :n] += math.exp(ln_lambda) * h
     d = g.T @ white.data

@@ -32,7 +32,7 @@ from engine import EngineError, Observation, load_camera, load_system, measure_i
 from engine.conventions import FloatArray, magnitude_to_rate, rate_to_magnitude
 from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.cusps import place_cusps
-from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens, source_position
@@ -137,7 +137,7 @@ def psf_star(sky: Sky, psf: FloatArray) -> FloatArray:
     """A star through the same dithers and drizzle, on a stamp whose middle is not its peak."""
     exposures = replace(sky.scene.system.exposures, field_pixels=_PSF_FIELD)
     scene = replace(sky.scene, system=replace(sky.scene.system, exposures=exposures))
-    image = PointResponse(psf, scene_geometry(scene), detector_kernel(scene.camera)).image(*sky.star)
+    image = ExposedOptics(psf, scene_geometry(scene), detector_kernel(scene.camera)).point_source(*sky.star)
     row, column = np.unravel_index(int(np.argmax(image)), image.shape)
     rows, columns = (slice(int(at) - _PSF_PEAK, int(at) - _PSF_PEAK + _PSF_SIDE) for at in (row, column))
     return np.asarray(image[rows, columns])
@@ -200,7 +200,7 @@ def compare(seed: int, *, inversion: bool) -> dict[str, Any]:
     except EngineError as error:
         seconds = time.perf_counter() - began
         return {**record, "error": str(error), "wrong": [f"{type(error).__name__}: {error}"], "seconds": seconds}
-    values = {name: getattr(found.host, name) for name in ("magnitude", "radius", "n")}
+    values = {"magnitude": found.host.magnitude, "radius": found.host.r_eff, "n": found.host.n}
     values |= {name: found.lens[name] for name in _LENS}
     wrong = [] if len(found.agn) == record["agn"] else [f"{len(found.agn)} AGN images of {record['agn']}"]
     low, high = values["magnitude"].interval95

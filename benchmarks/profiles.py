@@ -14,19 +14,17 @@ import time
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from engine import Analysis, Host, Realization, measure, simulate_realization
+from engine import Analysis, Host, Realization, Reconstruction, analyse, simulate_realization
 from engine.catalogue import system_names
 from engine.digest import engine_digest
-from engine.run import Measurement
 from engine.spec.analysis import ProfileName
 
 TABLE = Path(__file__).resolve().parent.parent / "docs" / "tables" / "profiles.md"
 PROFILES: tuple[ProfileName, ...] = ("reference", "standard", "draft")
 
 
-def quantities(found: Measurement) -> np.ndarray:
+def quantities(found: Reconstruction) -> np.ndarray:
     """Means and deviations (quantities, 2) of the lens."""
     return np.array([(p.value.mean, p.value.sd) for p in found.lens])
 
@@ -65,20 +63,20 @@ def main() -> None:
         reference: np.ndarray | None = None
         for profile in PROFILES:
             began = time.process_time()
-            with threadpool_limits(1):
-                found = measure(
-                    simulation.observation,
-                    Analysis(profile=profile),
-                    np.random.default_rng(1),
-                    agn_images=len(simulation.scene.agn),
-                    shear=lens.gamma1 != 0.0 or lens.gamma2 != 0.0,
-                )
+            found = analyse(
+                simulation.observation,
+                Analysis(profile=profile),
+                np.random.default_rng(1),
+                agn_images=len(simulation.scene.agn),
+                shear=lens.gamma1 != 0.0 or lens.gamma2 != 0.0,
+            )
             seconds = time.process_time() - began
             here = quantities(found)
             reference = here if reference is None else reference
             means = float(np.abs((here[:, 0] - reference[:, 0]) / reference[:, 1]).max())
             widths = float(np.abs(here[:, 1] / reference[:, 1] - 1.0).max())
-            chain = found.chain.summary
+            assert found.inversion is not None
+            chain = found.inversion.chain.summary
             magnitude = next(e for e in found.estimates if (e.estimator, e.index_prior) == ("image", "wide")).magnitude
             rows.setdefault(system, []).append(
                 f"| {system} | {profile} | `{engine_digest()[:8]}` | {seconds:.0f} | {chain.evaluations} | "

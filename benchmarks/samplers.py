@@ -23,8 +23,8 @@ from engine.likelihood.problem import prepare_problem
 from engine.parametric.fit import fit_parametric
 from engine.posterior.chain import run_chain
 from engine.posterior.optimum import Laplace, find_optimum
+from engine.posterior.start import find_start, prepare_target
 from engine.posterior.target import Target
-from engine.run import find_start, prepare_target
 
 BOX = 30.0
 """Half a side of the box that nautilus searches, in standard deviations: a favour, the prior is far wider."""
@@ -67,7 +67,7 @@ def main() -> None:
     with threadpool_limits(1):
         began = time.process_time()
         fit = fit_parametric(simulation.observation, agn_images=len(scene.agn), shear=shear)
-        target = prepare_target(prepare_problem(simulation.observation, fit, analysis), fit, analysis, shear=shear)
+        target = prepare_target(prepare_problem(simulation.observation, fit, analysis), fit, analysis)
         laplace = find_optimum(target, *find_start(target, fit))
         chain = run_chain(
             target,

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from benchmarks.psf_figures import effective_psf, encircled_energy, full_width_half_maximum
 from benchmarks.timing import least
 from engine.catalogue import camera_names, load_camera, load_dither, read_catalogue, system_names
 from engine.conventions import FloatArray
@@ -28,9 +29,6 @@ from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import draw_noise, exposure_noise
 from engine.imaging.psf import (
     detector_kernel,
-    effective_psf,
-    encircled_energy,
-    full_width_half_maximum,
     telescope_psf,
 )
 from engine.lensing.lens_equation import solve_lens_equation

@@ -102,6 +102,7 @@ def measure(problem: Problem, clean: FloatArray, noise: FloatArray, lens: PowerL
     """One layout: ``clean`` (ny, nx) is the image without noise, ``noise`` (ny, nx) its standard deviation."""
     likelihood, model, mask = problem.likelihood, layout.model, problem.mask
     found = find_strength(likelihood, lens, model)
+    decided = invert(likelihood, lens, found.ln_lambda, model).effective_parameters()
     ln_z = ln_evidence(likelihood, lens, found.ln_lambda, model)
     bare = with_data(likelihood, clean[mask])
     inversion = invert(bare, lens, found.ln_lambda, model)
@@ -110,7 +111,7 @@ def measure(problem: Problem, clean: FloatArray, noise: FloatArray, lens: PowerL
     residual = ((clean[mask] - image) / noise[mask])[~problem.core[mask]]
     ms = cpu_ms(lambda: ln_evidence(likelihood, lens, found.ln_lambda, model))
     rms = float(np.sqrt(np.mean(residual**2)))
-    return Point(rms, float(np.abs(residual).max()), ln_z, found.effective_parameters, ms)
+    return Point(rms, float(np.abs(residual).max()), ln_z, decided, ms)
 
 
 def host_of(system: str, n: float) -> Host:

@@ -8,6 +8,7 @@ import engine.home  # noqa: F401 - before Astropy is imported
 # isort: split
 
 from engine.acceptance import check_realization
+from engine.analyse import Reconstruction, analyse
 from engine.biases import (
     BIN_WIDTH,
     GROUPINGS,
@@ -33,6 +34,7 @@ from engine.biases import (
     trend_series,
 )
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
+from engine.compare import compare
 from engine.digest import engine_digest, engine_versions
 from engine.errors import (
     EngineError,
@@ -62,10 +64,21 @@ from engine.imaging.external import NoiseFromImage, observation_from_arrays
 from engine.imaging.external_files import read_external_observation
 from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.observation import Observation
-from engine.inspection import InversionView, inspect_inversion, inspect_simulation
-from engine.measure import HostEstimate, ImageMeasurement, Measured, measure_image
-from engine.result import Aperture, ChainSummary, Estimate, LensParameter, Products, Quantity, RunResult, StageTime
-from engine.run import STAGES, Measurement, Truth, measure, run
+from engine.inspection import InversionView, inspect_inversion
+from engine.measure import ImageMeasurement, measure_image
+from engine.result import (
+    Aperture,
+    ChainSummary,
+    Estimate,
+    ImagePlane,
+    LensParameter,
+    Products,
+    Quantity,
+    RunResult,
+    SourcePlane,
+    StageTime,
+)
+from engine.run import inspect_simulation, run
 from engine.simulation.scene import check_analysis, check_system
 from engine.simulation.seeds import generator
 from engine.simulation.simulate import Simulation, simulate_realization
@@ -83,6 +96,7 @@ from engine.spec.realization import (
 )
 from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
+from engine.stages import STAGES
 from engine.user_files import read_camera, read_mapping, read_system
 
 __all__ = [
@@ -110,10 +124,10 @@ __all__ = [
     "GridRun",
     "Grouping",
     "Host",
-    "HostEstimate",
     "HostQuantity",
     "Identifier",
     "ImageMeasurement",
+    "ImagePlane",
     "Indices",
     "InversionError",
     "InversionView",
@@ -121,8 +135,6 @@ __all__ = [
     "LensParameter",
     "LensSystem",
     "Magnitudes",
-    "Measured",
-    "Measurement",
     "NoiseFromImage",
     "NoiseLevel",
     "NothingToShowError",
@@ -136,10 +148,12 @@ __all__ = [
     "Quantity",
     "Radii",
     "Realization",
+    "Reconstruction",
     "Replicates",
     "RunResult",
     "Simulation",
     "Slopes",
+    "SourcePlane",
     "SpecError",
     "Spread",
     "StageTime",
@@ -148,13 +162,14 @@ __all__ = [
     "Trend",
     "TrendBin",
     "TrendSeries",
-    "Truth",
+    "analyse",
     "bias_points",
     "camera_from_mapping",
     "camera_names",
     "check_analysis",
     "check_realization",
     "check_system",
+    "compare",
     "complaint",
     "configuration_of",
     "coverage_curve",
@@ -169,7 +184,6 @@ __all__ = [
     "load_camera",
     "load_system",
     "mean_bias",
-    "measure",
     "measure_image",
     "observation_from_arrays",
     "path_steps",

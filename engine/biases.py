@@ -18,8 +18,9 @@ from scipy.special import ndtri
 
 from engine.conventions import FloatArray
 from engine.errors import FigureError, NothingToShowError
-from engine.result import EstimatorName, IndexPrior, Quantity, RunResult
+from engine.result import IndexPrior, Quantity, RunResult
 from engine.simulation.scene import resolve_system
+from engine.spec.analysis import EstimatorName
 from engine.spec.realization import Realization
 
 HostQuantity = Literal["magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y"]

@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+MOST_ELLIPTICAL = 0.9
+"""Largest e = (1 - q)/(1 + q), q = 0.05, that ellipticity components stand for."""
+
 
 def image_angle(position_angle_deg: float) -> float:
     """Angle in the image frame [rad] of a position angle [deg East of North].
@@ -44,6 +47,28 @@ def sky_to_image_shear(shear: tuple[float, float]) -> tuple[float, float]:
     return shear[0], -shear[1]
 
 
+def ellipticity(q: float, phi: float) -> tuple[float, float]:
+    """Components (e1, e2) = e (cos 2 phi, sin 2 phi), e = (1 - q)/(1 + q), of an axis ratio and an angle [rad].
+
+    They are smooth through the circle, where axis ratio and angle are not.
+    """
+    e = (1.0 - q) / (1.0 + q)
+    return e * math.cos(2.0 * phi), e * math.sin(2.0 * phi)
+
+
+def axis_ratio_and_angle(e1: float, e2: float) -> tuple[float, float]:
+    """Axis ratio and angle [rad] of ellipticity components; e is cut at :data:`MOST_ELLIPTICAL`."""
+    e = min(math.hypot(e1, e2), MOST_ELLIPTICAL)
+    return (1.0 - e) / (1.0 + e), 0.5 * math.atan2(e2, e1)
+
+
+def ellipticity_jacobian(e1: float, e2: float) -> FloatArray:
+    """Derivatives (2, 2) of :func:`axis_ratio_and_angle` by the components; at the circle those close to it."""
+    e = max(math.hypot(e1, e2), 1e-4)
+    slope = -2.0 / (1.0 + e) ** 2
+    return np.array([[slope * e1 / e, slope * e2 / e], [-0.5 * e2 / e**2, 0.5 * e1 / e**2]])
+
+
 def magnitude_to_rate(magnitude: float, zero_point: float) -> float:
     """Count rate [e-/s] of an AB magnitude."""
     return float(10.0 ** (0.4 * (zero_point - magnitude)))
@@ -64,11 +89,6 @@ def paper_einstein_radius(theta_E: float, q: float, slope: float) -> float:
     """
     eta = slope - 1.0
     return float(theta_E * q**-0.5 * ((1.0 + q) / 2.0) ** (1.0 / eta))
-
-
-def intermediate_einstein_radius(paper_radius: float, q: float, slope: float) -> float:
-    """Intermediate-axis theta_E [arcsec] from R_E of the paper's eq. (2)."""
-    return float(paper_radius / paper_einstein_radius(1.0, q, slope))
 
 
 def pixel_centres(n: int, scale: float) -> FloatArray:

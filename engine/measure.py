@@ -1,36 +1,38 @@
-"""From an observation that anybody made to the host galaxy: the parametric fit, the inversion, and one answer.
+"""From an observation that anybody made to the host galaxy: the analysis of a run, and one answer.
 
-Nothing of the truth is known here. The lens and the AGN images are found by
-:func:`~engine.parametric.fit.fit_parametric`; :func:`~engine.run.measure` then samples the inversion from there.
+Nothing is known here of exposures, truth or errors of the noise map, so that the map is compared with the scatter, the
+inversion may fail, and a fit that is poor is shown with a status that says so.
 """
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from engine.conventions import FloatArray, position_angle, rate_to_magnitude
+from engine.analyse import SampledInversion, analyse, lens_of_fit
+from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
+from engine.estimators.image import image_estimate
 from engine.imaging.observation import Observation
-from engine.parametric.fit import HOST_NAMES, Acceptance, ParametricFit, fit_parametric
-from engine.parametric.psf_error import noise_scale
-from engine.result import Estimate, LensParameter
-from engine.run import Measurement, measure
+from engine.parametric.fit import ParametricFit
+from engine.parametric.residual_noise import noise_scale
+from engine.parametric.search import Acceptance
+from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
+from engine.stages import Progress
 
 MeasurementStatus = Literal["ok", "poor_fit"]
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on the status says that the model does not describe the image."""
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
-_NORMAL_95 = 1.959963985
+_NAMES = {"image": "parametric"}
+"""What documents call an estimator, where that is not its name: they did so before it had one."""
 _NOISE_AGREES = 0.1
 _WRONG_STAMP = 2.0
 """Error of the PSF's stamp, in units of what is allowed for, from which on the result says so."""
@@ -46,27 +48,6 @@ def profile_analysis(profile: str, observation: Observation) -> Analysis:
     if observation.covariance is None:
         return Analysis(profile=profile, noise_treatment="diagonal")  # type: ignore[arg-type]  # checked above
     return Analysis(profile=profile)  # type: ignore[arg-type]  # checked above
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A quantity: mean, standard deviation, and the interval that holds it with 95 %."""
-
-    mean: float
-    sd: float
-    interval95: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class HostEstimate:
-    """One estimator's host: AB magnitude, half-light radius [arcsec, intermediate axis], index, q, PA [deg E of N]."""
-
-    estimator: str
-    magnitude: Measured
-    radius: Measured
-    n: Measured
-    q: Measured
-    position_angle: Measured
 
 
 @dataclass(frozen=True)
@@ -90,10 +71,10 @@ class ImageMeasurement:
     then say.
     """
 
-    host: HostEstimate
-    estimates: tuple[HostEstimate, ...]
-    lens: dict[str, Measured]
-    lens_by_inversion: dict[str, Measured] | None
+    host: Estimate
+    estimates: tuple[Estimate, ...]
+    lens: dict[str, Quantity]
+    lens_by_inversion: dict[str, Quantity] | None
     agn: tuple[AgnPosition, ...]
     arc_magnitude: float
     chi2_per_dof: float
@@ -110,12 +91,12 @@ class ImageMeasurement:
     provenance: dict[str, str | float | int]
     observation: Observation
     fit: ParametricFit
-    inversion: Measurement | None
+    inversion: SampledInversion | None
 
     @property
     def estimator(self) -> str:
-        """Name of the estimator whose answer ``host`` is."""
-        return self.host.estimator
+        """What its documents call the estimator whose answer ``host`` is."""
+        return _NAMES.get(self.host.estimator, self.host.estimator)
 
     @property
     def inversion_chi2_per_dof(self) -> float | None:
@@ -123,9 +104,9 @@ class ImageMeasurement:
         if self.inversion is None:
             return None
         chi2 = self.inversion.chi2
-        if self.observation.response is None:
+        if self.observation.optics.misfit_is_noise:
             # The inversion takes what the fit misses for noise, which must not make the two incomparable.
-            residual = self.inversion.products.residual * self.observation.noise
+            residual = self.inversion.image_plane.residual * self.observation.noise
             chi2 = _chi2(self.observation, self.fit, residual, self.noise_scale)
         return chi2 / self.inversion.degrees_of_freedom
 
@@ -135,17 +116,17 @@ class ImageMeasurement:
         return {
             "status": self.status,
             "estimator": self.estimator,
-            "host": asdict(self.host),
-            "lens": {name: asdict(value) for name, value in self.lens.items()},
+            "host": _host_document(self.host),
+            "lens": {name: _document(value) for name, value in self.lens.items()},
             "chi2_per_dof": self.chi2_per_dof,
             "chi2_per_dof_as_given": self.chi2_per_dof_as_given,
             "noise_scale": self.noise_scale,
             "degrees_of_freedom": self.degrees_of_freedom,
-            "estimates": [asdict(estimate) for estimate in self.estimates],
+            "estimates": [_host_document(estimate) for estimate in self.estimates],
             "lens_by_inversion": (
                 None
                 if self.lens_by_inversion is None
-                else {name: asdict(value) for name, value in self.lens_by_inversion.items()}
+                else {name: _document(value) for name, value in self.lens_by_inversion.items()}
             ),
             "chain": None if chain is None else asdict(chain),
             "inversion_chi2_per_dof": self.inversion_chi2_per_dof,
@@ -164,9 +145,20 @@ class ImageMeasurement:
         }
 
 
-def measured(mean: float, sd: float) -> Measured:
-    """A quantity with a normal distribution."""
-    return Measured(mean, sd, (mean - _NORMAL_95 * sd, mean + _NORMAL_95 * sd))
+def _document(value: Quantity) -> dict[str, Any]:
+    return {"mean": value.mean, "sd": value.sd, "interval95": list(value.interval95)}
+
+
+def _host_document(found: Estimate) -> dict[str, Any]:
+    values = {
+        "magnitude": found.magnitude,
+        "radius": found.r_eff,
+        "n": found.n,
+        "q": found.q,
+        "position_angle": found.position_angle,
+    }
+    name = _NAMES.get(found.estimator, found.estimator)
+    return {"estimator": name, **{key: _document(value) for key, value in values.items()}}
 
 
 def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, scale: float) -> float:
@@ -176,44 +168,8 @@ def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, sc
     return float(np.sum(residual[used] ** 2 / variance))
 
 
-def _parametric_estimate(fit: ParametricFit, zero_point: float, inflation: float) -> HostEstimate:
-    """The parametric host with the errors of its Gaussian approximation, everything else free."""
-    sd = dict(zip(HOST_NAMES, inflation * np.sqrt(np.diag(fit.host_covariance)), strict=True))
-    host = fit.host
-    magnitude = rate_to_magnitude(host.flux, zero_point)
-    # Magnitude and radius are normal in the logarithm: an interval of a radius does not reach below zero.
-    spread = float(sd["r_eff"]) / host.r_eff
-    low, high = (host.r_eff * math.exp(sign * _NORMAL_95 * spread) for sign in (-1.0, 1.0))
-    return HostEstimate(
-        "parametric",
-        measured(magnitude, 2.5 / math.log(10.0) * float(sd["flux"]) / host.flux),
-        Measured(host.r_eff, float(sd["r_eff"]), (low, high)),
-        measured(host.n, float(sd["n"])),
-        measured(host.q, float(sd["q"])),
-        measured(position_angle(host.phi), math.degrees(float(sd["phi"]))),
-    )
-
-
-def _host_estimate(found: Estimate) -> HostEstimate:
-    return HostEstimate(
-        found.estimator,
-        *(
-            measured(quantity.mean, quantity.sd)
-            for quantity in (found.magnitude, found.r_eff, found.n, found.q, found.position_angle)
-        ),
-    )
-
-
-def _lens_of_chain(parameters: Sequence[LensParameter]) -> dict[str, Measured]:
-    return {found.name: measured(found.value.mean, found.value.sd) for found in parameters}
-
-
-def _lens_of_fit(fit: ParametricFit, inflation: float) -> dict[str, Measured]:
-    sd = inflation * np.sqrt(np.diag(fit.lens_covariance))
-    return {
-        name: measured(float(getattr(fit.lens, name)), float(error))
-        for name, error in zip(fit.lens_names, sd, strict=True)
-    }
+def _by_name(parameters: Sequence[LensParameter]) -> dict[str, Quantity]:
+    return {found.name: found.value for found in parameters}
 
 
 def measure_image(
@@ -227,7 +183,7 @@ def measure_image(
     positions: Sequence[tuple[float, float]] | None = None,
     seed: int = 0,
     inversion: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
 ) -> ImageMeasurement:
     """Measure the host galaxy in an observation.
 
@@ -250,7 +206,7 @@ def measure_image(
     inversion : bool
         Whether to sample the inversion as well; the parametric fit alone takes seconds.
     progress : callable, optional
-        Told the name of each stage as it begins.
+        Told each stage, and how far it is.
 
     Raises
     ------
@@ -263,29 +219,17 @@ def measure_image(
     analysis = profile_analysis(profile, observation)
     if not 0 <= seed < 2**63:
         raise SpecError("seed", seed, "a whole number from 0 to 2^63 - 1")
-    warnings: list[str] = []
-    found: Measurement | None = None
-    tell = progress or (lambda _: None)
-    with threadpool_limits(1):
-        tell("parametric fit")
-        fit = fit_parametric(
-            observation, agn_images=agn_images, deflector=deflector, shear=shear, theta_E=theta_E, positions=positions,
-            acceptance=_ANY_LENS,
-        )  # fmt: skip
-        if inversion:
-            tell("inversion")
-            try:
-                found = measure(
-                    observation,
-                    analysis,
-                    np.random.default_rng(seed),
-                    agn_images=len(fit.agn),
-                    deflector=deflector,
-                    shear="gamma1" in fit.lens_names,
-                    fit=fit,
-                )
-            except (PosteriorError, InversionError, ObservationError) as error:
-                warnings.append(f"inversion: {error}")
+    rng = np.random.default_rng(seed)
+    found = analyse(
+        observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
+        shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
+    )  # fmt: skip
+    fit, warnings = found.fit, []
+    if inversion:
+        try:
+            found = analyse(observation, analysis, rng, fit=fit, progress=progress)
+        except (PosteriorError, InversionError, ObservationError) as error:
+            warnings.append(f"inversion: {error}")
     residual = observation.image - fit.model
     measured = noise_scale(observation, residual, fit.sigma, fit.lens)
     if measured is None:
@@ -296,16 +240,9 @@ def measure_image(
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")
     # Where the map is too large the errors keep it: its excess stands for the noise that neighbouring pixels share.
     inflation = max(1.0, scale)
-    estimates = [_parametric_estimate(fit, observation.zero_point, inflation)]
-    lens = _lens_of_fit(fit, inflation)
-    if found is not None:
-        # "image" is draws of the parametric fit, which is there already.
-        estimates += [
-            _host_estimate(estimate)
-            for estimate in found.estimates
-            if estimate.index_prior == "wide" and estimate.estimator != "image"
-        ]
-        warnings += found.warnings
+    host = image_estimate(fit.hosts["wide"].inflated(inflation), "wide", observation.zero_point)
+    drawn = () if found.inversion is None else found.inversion.estimates
+    warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
         warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
@@ -313,12 +250,11 @@ def measure_image(
     if chi2 > POOR_FIT:
         status = "poor_fit"
         warnings.append(f"model: chi2 per degree of freedom is {chi2:.2f}; the errors do not cover what it misses")
-    by_inversion = None if found is None else _lens_of_chain(found.lens)
     return ImageMeasurement(
-        host=estimates[0],
-        estimates=tuple(estimates),
-        lens=lens,
-        lens_by_inversion=by_inversion,
+        host=host,
+        estimates=(host, *(estimate for estimate in drawn if estimate.index_prior == "wide")),
+        lens=_by_name(lens_of_fit(fit, inflation)),
+        lens_by_inversion=None if found.inversion is None else _by_name(found.inversion.lens),
         agn=tuple(
             AgnPosition(image.x, image.y, rate_to_magnitude(image.flux, observation.zero_point))
             for image in fit.agn
@@ -339,5 +275,5 @@ def measure_image(
         provenance=dict(observation.provenance),
         observation=observation,
         fit=fit,
-        inversion=found,
+        inversion=found.inversion,
     )

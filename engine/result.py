@@ -1,47 +1,67 @@
-"""What a run returns: typed numbers for the database, and arrays for figures and files."""
+"""What an analysis and a run return: typed numbers for the database, and arrays for figures and files."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal, get_args
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
+from engine.spec.analysis import EstimatorName
 
-EstimatorName = Literal["paper", "covariance", "projected", "image"]
 IndexPrior = Literal["wide", "free", "fixed"]
-ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
 INDEX_PRIORS: tuple[IndexPrior, ...] = get_args(IndexPrior)
 INDEX_RANGES: dict[IndexPrior, tuple[float, float]] = {"wide": (0.3, 8.0), "free": (1.0, 4.0)}
 """Flat priors of n; ``free`` is the paper's section 4.2, 'we constrain n to be in the range 1-4'."""
 ChainStatus = Literal["converged", "not_converged"]
+_NORMAL_95 = 1.959963985
+"""Standard deviations on either side of the mean that hold 95 % of a normal distribution."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A recovered quantity: mean and standard deviation over the draws, the truth where there is one."""
+    """A recovered quantity: mean, standard deviation, and the truth where there is one.
+
+    It is normally distributed, or its logarithm is where it is ``log_normal``: a radius does not reach below zero.
+    """
 
     mean: float
     sd: float
     truth: float | None = None
+    log_normal: bool = False
 
     @property
     def bias(self) -> float | None:
         """Recovered mean minus truth, None without a truth."""
         return None if self.truth is None else self.mean - self.truth
 
+    @property
+    def interval95(self) -> tuple[float, float]:
+        """The interval that holds it with 95 %."""
+        if not self.log_normal:
+            return self.mean - _NORMAL_95 * self.sd, self.mean + _NORMAL_95 * self.sd
+        variance = math.log1p((self.sd / self.mean) ** 2)
+        middle, reach = math.log(self.mean) - 0.5 * variance, _NORMAL_95 * math.sqrt(variance)
+        return math.exp(middle - reach), math.exp(middle + reach)
+
+    def beside(self, truth: float, period: float | None = None) -> Quantity:
+        """The same beside its truth; a quantity with a period moves by as many of them as bring it nearest."""
+        mean = self.mean if period is None else truth + math.remainder(self.mean - truth, period)
+        return replace(self, mean=mean, truth=truth)
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """One estimator's answer over ``draws`` draws.
+    """One estimator's answer from ``draws`` fits: one to each drawn source, or the one to the image itself.
 
     Total magnitude [AB], r_eff [arcsec, intermediate axis], n, q, position angle [deg], centre x, y [arcsec, source
     plane in the image frame]; ``r_eff_galfit`` is GALFIT's radius, on the major axis: r_eff / sqrt(q).
 
-    ``at_bound`` counts the draws whose fit ended at a bound of n or of r_eff, ``n_at_bound`` and ``r_eff_at_bound``
-    those of each; ``failed`` counts those that could not be fitted and are left out of the means.
+    ``at_bound`` counts the fits that ended at a bound of n or of r_eff, ``n_at_bound`` and ``r_eff_at_bound`` those of
+    each; ``failed`` counts those that did not succeed and are left out of the means.
     """
 
     estimator: EstimatorName
@@ -116,13 +136,11 @@ class StageTime:
 
 
 @dataclass(frozen=True)
-class Products:
-    """Arrays of a run: image-plane maps on the drizzled grid, source-plane maps on the source grid.
+class ImagePlane:
+    """Maps on the pixels of an observation.
 
-    ``image``, ``model``, ``residual`` (normalised) are (ny, nx) in e-/s and sigma; ``mask`` is True where fitted;
-    ``source``, ``source_truth`` and ``source_sd`` are (ny, nx) in e-/s per arcsec^2 on cells with edges
-    ``source_x_edges`` (nx + 1,) and ``source_y_edges`` (ny + 1,) [arcsec]; ``chain`` is (samples, parameters) in the
-    order of ``parameter_names``.
+    ``image``, ``noise``, ``model`` and ``arc_model`` (the lensed host) are (ny, nx) in e-/s, ``residual`` in units of
+    the noise; ``mask`` is True where fitted; ``pixel_scale`` in arcsec.
     """
 
     image: FloatArray
@@ -132,13 +150,37 @@ class Products:
     residual: FloatArray
     mask: NDArray[np.bool_]
     pixel_scale: float
+
+
+@dataclass(frozen=True)
+class SourcePlane:
+    """Maps of an inversion on its source grid, and the samples that it is one of.
+
+    ``source``, ``source_sd`` and ``source_truth`` (None where it is not known) are (ny, nx) in e-/s per arcsec^2 on
+    cells with edges ``source_x_edges`` (nx + 1,) and ``source_y_edges`` (ny + 1,) [arcsec]; ``chain`` is (samples,
+    parameters) in the order of ``parameter_names``.
+    """
+
     source: FloatArray
     source_sd: FloatArray
-    source_truth: FloatArray | None
     source_x_edges: FloatArray
     source_y_edges: FloatArray
     chain: FloatArray
     parameter_names: tuple[str, ...]
+    source_truth: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Products:
+    """Arrays of a run for figures and files; ``source_plane`` is None where there was no inversion."""
+
+    image_plane: ImagePlane
+    source_plane: SourcePlane | None
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Every array and number by its name."""
+        values = vars(self.image_plane) | ({} if self.source_plane is None else vars(self.source_plane))
+        return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -147,6 +189,8 @@ class RunResult:
 
     ``profile`` names the analysis profile, None where the analysis was put together by hand. An estimator that could
     not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
+    ``chain``, ``ln_evidence``, ``condition_number`` and ``aperture`` are None where no estimator needed an inversion;
+    ``lens``, ``chi2`` and ``degrees_of_freedom`` are then those of the parametric fit. With one,
     ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.
     ``arc_magnitude`` is the AB magnitude of the lensed host in the image plane, ``agn_contrast`` AGN minus arc
     magnitude, ``surface_brightness`` the host's mean surface brightness inside r_eff [mag arcsec^-2] (the paper's
@@ -163,11 +207,11 @@ class RunResult:
     estimates: tuple[Estimate, ...]
     aperture: Aperture | None
     lens: tuple[LensParameter, ...]
-    chain: ChainSummary
-    ln_evidence: float
+    chain: ChainSummary | None
+    ln_evidence: float | None
     chi2: float
     degrees_of_freedom: int
-    condition_number: float
+    condition_number: float | None
     arc_magnitude: float
     agn_contrast: float | None
     surface_brightness: float

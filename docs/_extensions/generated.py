@@ -149,22 +149,22 @@ def _bounds(schema: dict[str, Any]) -> str:
 
 
 def engine_markdown() -> str:
-    """Everything that ``engine`` exports, by package; the types of single fields are left out."""
-    import engine  # noqa: PLC0415 - as above
-
-    rooms: dict[str, list[str]] = {}
-    for name in engine.__all__:
-        found = getattr(engine, name)
-        if inspect.isclass(found) or inspect.isfunction(found):
-            rooms.setdefault(".".join(found.__module__.split(".")[:2]), []).append(name)
+    """Everything that ``engine`` and ``engine.figures`` export, by package; the types of single fields are left out."""
+    rooms: dict[str, list[tuple[str, str]]] = {}
+    for module in ("engine", "engine.figures"):
+        exported = importlib.import_module(module)
+        for name in exported.__all__:
+            found = getattr(exported, name)
+            if inspect.isclass(found) or inspect.isfunction(found):
+                room = ".".join(found.__module__.split(".")[:2])
+                rooms.setdefault(room, []).append((module, name))
+    first = [room for room in FIRST if room in rooms]
     out = []
-    for room, names in sorted(
-        rooms.items(), key=lambda item: (FIRST.index(item[0]) if item[0] in FIRST else len(FIRST), item[0])
-    ):
+    for room in (*first, *sorted(rooms.keys() - set(first))):
         out.append(f"## {room}\n\n{_first_paragraph(importlib.import_module(room))}\n")
-        out += [
-            _documented("engine", name, "###") for name in sorted(names, key=lambda name: (name[0].isupper(), name))
-        ]
+        # Functions before classes: these are what functions take and give.
+        for module, name in sorted(rooms[room], key=lambda item: (item[1][0].isupper(), item[1])):
+            out.append(_documented(module, name, "###"))
     return "\n".join(out)
 
 

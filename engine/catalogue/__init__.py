@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
@@ -58,35 +58,29 @@ def system_facts(name: str) -> dict[str, Any]:
     return facts
 
 
-def _pick(group: dict[str, Any], *fields: str) -> dict[str, Any]:
-    return {field: group[field] for field in fields if field in group}
+_Specified = TypeVar("_Specified")
+
+
+def _read(adapter: TypeAdapter[_Specified], name: str, document: dict[str, Any]) -> _Specified:
+    """An entry as its specification; sources, confidences and notes that stand beside the values are passed over."""
+    try:
+        return adapter.validate_python({**document, "name": name}, extra="ignore")
+    except ValidationError as error:
+        raise spec_error(error, prefix=name) from error
 
 
 @cache
 def load_system(name: str) -> LensSystem:
     """The lens system called ``name`` (short form, as HE0435)."""
     facts = system_facts(name)
-    light = ("magnitude", "r_eff", "n", "q", "position_angle", "centre")
-    mass = ("theta_E", "q", "position_angle", "slope", "source_position", "centre", "shear")
-    document = {
-        "name": name,
-        "camera": facts["camera"],
-        "exposures": _pick(facts["exposures"], "field_pixels", "dither", "long_s", "n_long", "short_s"),
+    shape = facts["host_shape"]
+    gathered = {
         "agn": [{"name": label, **image} for label, image in facts["agn"]["images"].items()],
-        "deflector": _pick(facts["deflector"], *light),
         "coordinates": facts["coordinates"]["degrees"],
-        "priors": facts.get("priors", {}),
-        "host_q": facts["host_shape"]["q"],
-        "host_position_angle": facts["host_shape"]["position_angle"],
-        "mass_models": {
-            model: {slope: _pick(entry, *mass) for slope, entry in by_slope.items()}
-            for model, by_slope in facts["mass_models"].items()
-        },
+        "host_q": shape["q"],
+        "host_position_angle": shape["position_angle"],
     }
-    try:
-        return _SYSTEM.validate_python(document)
-    except ValidationError as error:
-        raise spec_error(error, prefix=name) from error
+    return _read(_SYSTEM, name, {**facts, **gathered})
 
 
 @cache
@@ -95,40 +89,20 @@ def load_camera(name: str) -> Camera:
     catalogue = read_catalogue("cameras")
     if name not in catalogue["cameras"]:
         raise SpecError("camera", name, f"one of {list(catalogue['cameras'])}")
-    facts, telescope = catalogue["cameras"][name], catalogue["telescope"]
+    facts = catalogue["cameras"][name]
     zernikes = facts["pupil"].get("zernike_waves_at_547nm", {})
-    document = {
-        "name": name,
-        **_pick(
-            facts,
-            "pixel_scale",
-            "drizzled_scale",
-            "pixfrac",
-            "drizzle_kernel",
-            "oversampling",
-            "zero_point",
-            "gain",
-            "full_well_e",
-            "read_noise_e",
-            "dark_e_s",
-            "sky_e_s",
-        ),
+    gathered = {
         "read_noise_short_e": facts.get("read_noise_short_e", facts["read_noise_e"]),
-        "noise_author": facts["noise_author"]
-        and _pick(facts["noise_author"], "std_long_e_s", "std_short_e_s", "bright_threshold_e_s"),
         "wavelength_nm": facts["bandpass"]["wavelength_nm"],
         "throughput": facts["bandpass"]["throughput"],
         "pupil": {
-            **_pick(telescope, "primary_diameter_m", "secondary", "spider_width", "pads"),
-            **_pick(facts["pupil"], "rotation_deg", "cold_mask"),
+            **catalogue["telescope"],
+            **facts["pupil"],
             "zernike_waves_at_547nm": [(int(term[1:]), waves) for term, waves in zernikes.items()],
         },
         "detector_kernel": facts["detector_kernel"]["matrix"],
     }
-    try:
-        return _CAMERA.validate_python(document)
-    except ValidationError as error:
-        raise spec_error(error, prefix=name) from error
+    return _read(_CAMERA, name, {**facts, **gathered})
 
 
 @cache
@@ -137,4 +111,4 @@ def load_dither(name: str) -> Dither:
     dithers = read_catalogue("cameras")["dithers"]
     if name not in dithers:
         raise SpecError("dither", name, f"one of {list(dithers)}")
-    return _DITHER.validate_python({"name": name, **_pick(dithers[name], "subpixels", "shifts")})
+    return _read(_DITHER, name, dithers[name])

@@ -1,8 +1,8 @@
-"""Sersic refits of reconstructed sources: one chain of draws, several estimators.
+"""Estimators of the host: a Sersic profile behind the lens, found in several ways.
 
-:mod:`.draws` is what they are given, :mod:`.estimators` fits every draw by every estimator, :mod:`.summaries` turns the
-fits into means, deviations and biases. The estimators differ in the sum of squares that a profile is to minimise, each
-in a module of its own:
+:mod:`.image` is the posterior of the parametric fit. The others fit sources drawn from a chain: :mod:`.draws` is what
+they are given, :mod:`.refit` fits every draw by every estimator, :mod:`.summaries` turns the fits into means and
+deviations. They differ in the sum of squares that a profile is to minimise, each in a module of its own:
 
 ========================  ==========================================================================
 :mod:`.paper`             unweighted on the drawn source map, as GALFIT without a sigma image
@@ -11,6 +11,5 @@ in a module of its own:
 :mod:`.image`             image-plane chi^2 of the ray-traced profile itself: no grid, no regularisation
 ========================  ==========================================================================
 
-:mod:`.aperture` measures the maps without a profile. :mod:`.profiles` has the profile and its derivatives averaged over
-cells, :mod:`.least_squares` the bounded fit of many draws at once.
+:mod:`.aperture` measures the maps without a profile; :mod:`.least_squares` is the bounded fit of many draws at once.
 """

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +14,6 @@ from engine.conventions import FloatArray
 from engine.lensing.power_law import PowerLawLens
 from engine.light.cell_means import MAX_ELLIPTICITY
 from engine.likelihood.evidence import Inversion
-from engine.parametric.host_posterior import HostPosterior
-from engine.result import IndexPrior
 from engine.source.grid import SourceGrid
 
 _SMALLEST_RADIUS = 0.1
@@ -58,17 +55,9 @@ class SourceDraw:
         e = MAX_ELLIPTICITY
         pitch = math.sqrt(float(self.grid.cell_areas.min()))
         side = max(right - left, top - bottom)
-        low = [math.log(_SMALLEST_RADIUS * pitch), -e, -e, left, bottom, index_range[0]]
-        high = [math.log(_LARGEST_RADIUS * side), e, e, right, top, index_range[1]]
+        low = [math.log(_SMALLEST_RADIUS * pitch), index_range[0], -e, -e, left, bottom]
+        high = [math.log(_LARGEST_RADIUS * side), index_range[1], e, e, right, top]
         return np.array(low), np.array(high)
-
-
-@dataclass(frozen=True)
-class DrawSet:
-    """Draws of one chain (one at least), and the host with each prior of n as the fit of the whole image has it."""
-
-    draws: tuple[SourceDraw, ...]
-    hosts: Mapping[IndexPrior, HostPosterior]
 
 
 def source_draw(inversion: Inversion, lens: PowerLawLens, rng: np.random.Generator) -> SourceDraw:

@@ -2,7 +2,8 @@
 
 Each draw has a sum of squares chi^2(p, f) = f^2 m^T W m - 2 f m^T b in the shape parameters p of a model m(p) of unit
 flux. The flux f is solved for at every step (variable projection), the shape moves by damped Gauss-Newton steps inside
-its bounds. The draws move in step, so that a metric whose W they share multiplies all their models by it at once.
+its bounds. The draws move in step, so that a metric whose W they share multiplies all their models by it at once; scipy
+would fit one at a time.
 """
 
 from __future__ import annotations

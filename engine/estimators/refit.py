@@ -1,9 +1,8 @@
-"""All estimators on all draws of one chain.
+"""The estimators that fit drawn sources, on all draws of one chain.
 
-``image`` knows the host from the whole image. The others fit the source of each draw: their fits start from one
-reference fit, that of the first draw, and from the centres that the estimator before found for each draw: the mean
-source is fitted first, from its moments. The widest range of n is fitted first; where a draw's fit lies within a
-narrower range, it is that range's fit too.
+Their fits start from one reference fit, that of the first draw, and from the centres that the estimator before found
+for each draw: the mean source is fitted first, from its moments. The widest range of n is fitted first; where a draw's
+fit lies within a narrower range, it is that range's fit too.
 """
 
 from __future__ import annotations
@@ -17,14 +16,15 @@ from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
 from engine.estimators.covariance import CovarianceMetric
-from engine.estimators.draws import DrawSet, SourceDraw
-from engine.estimators.image import refit_image
+from engine.estimators.draws import SourceDraw
 from engine.estimators.least_squares import Fits, Metric, fit_shapes, scatter
 from engine.estimators.paper import PaperMetric
 from engine.estimators.projected import ProjectedMetric
 from engine.estimators.sersic_fit import Refit, SersicFit
-from engine.light.cell_means import LN_R_EFF, N, X, Y, profile_of
-from engine.result import INDEX_RANGES, EstimatorName, IndexPrior
+from engine.light.cell_means import LN_R_EFF, N, X, Y
+from engine.light.sersic import profile_of
+from engine.result import INDEX_RANGES, IndexPrior
+from engine.spec.analysis import EstimatorName
 
 _BOUND_MARGIN = 1e-3
 _START_INDICES = (0.8, 2.0, 4.0)
@@ -42,7 +42,7 @@ def _moments(draw: SourceDraw) -> FloatArray:
     xx, yy, xy = (float((weight * u).sum()) for u in ((x - cx) ** 2, (y - cy) ** 2, (x - cx) * (y - cy)))
     size = max(xx + yy, float(grid.cell_areas.min()))
     e = np.clip(0.5 * np.array([(xx - yy) / size, 2 * xy / size]), -0.5, 0.5)
-    return np.array([0.5 * math.log(size), *e, cx, cy, 2.0])
+    return np.array([0.5 * math.log(size), 2.0, *e, cx, cy])
 
 
 @dataclass(frozen=True)
@@ -121,27 +121,25 @@ def _flagged(fits: Fits, shapes: FloatArray, fluxes: FloatArray, bounds: _Bounds
 
 
 def refit_draws(
-    drawn: DrawSet,
+    draws: Sequence[SourceDraw],
     estimators: Sequence[EstimatorName],
     fixed_index: float | None,
     rng: np.random.Generator,
 ) -> list[Refit]:
-    """Refit by every estimator, with n free, n in a wide range, and n held at ``fixed_index`` if there is one.
+    """Refit draws (one at least) by every estimator that fits drawn sources.
 
-    A fit that does not converge, or whose flux is not positive, is None.
+    With n free, n in a wide range, and n held at ``fixed_index`` if there is one. A fit that does not converge, or
+    whose flux is not positive, is None.
     """
     ranges = dict(INDEX_RANGES)
     if fixed_index is not None:
         ranges["fixed"] = (fixed_index, fixed_index)
-    bounds = {prior: _Bounds.of(drawn.draws, index_range) for prior, index_range in ranges.items()}
-    starts = np.repeat(_first_start(drawn.draws[0], bounds["wide"])[None], len(drawn.draws), axis=0)
-    seeds = [int(seed) for seed in rng.integers(2**63, size=len(drawn.draws))]
+    bounds = {prior: _Bounds.of(draws, index_range) for prior, index_range in ranges.items()}
+    starts = np.repeat(_first_start(draws[0], bounds["wide"])[None], len(draws), axis=0)
+    seeds = [int(seed) for seed in rng.integers(2**63, size=len(draws))]
     out = []
     for estimator in estimators:
-        if estimator == "image":
-            out += refit_image(drawn.hosts, tuple(bounds), len(seeds), seeds[0])
-            continue
-        found, wide = _refit_sources(estimator, drawn.draws, starts, bounds, seeds)
+        found, wide = _refit_sources(estimator, draws, starts, bounds, seeds)
         starts = np.where((wide.fluxes > 0)[:, None], wide.shapes, starts)
         out += found
     return out

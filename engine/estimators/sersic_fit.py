@@ -1,11 +1,12 @@
-"""What every estimator answers with."""
+"""What an estimator on drawn sources answers with."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from engine.light.sersic import SersicProfile
-from engine.result import EstimatorName, IndexPrior
+from engine.result import IndexPrior
+from engine.spec.analysis import EstimatorName
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from engine.conventions import FloatArray
 from engine.figures.sky import compass, empty_sky_noise, scale_bar, show, stretch, stretch_ticks
 from engine.inspection import InversionView
 from engine.posterior.traces import EvidenceTrace
-from engine.result import Products
+from engine.result import ImagePlane, SourcePlane
 
 _RESIDUAL_LIMIT = 5.0
 _TRACE_ROWS = 2
@@ -44,18 +44,16 @@ def _bar(figure: Figure, axes: Axes, shown: object, label: str) -> None:
     bar.set_label(label, fontsize=8)
 
 
-def _images(figure: Figure, axes: list[Axes], products: Products) -> None:
+def _images(figure: Figure, axes: list[Axes], plane: ImagePlane) -> None:
     """Data, model and normalised residual."""
-    scale, rows_columns = products.pixel_scale, np.argwhere(products.mask)
-    ny, nx = products.image.shape
+    scale, rows_columns = plane.pixel_scale, np.argwhere(plane.mask)
+    ny, nx = plane.image.shape
     reach = np.abs(rows_columns - 0.5 * (np.array([ny, nx]) - 1.0)).max()
     half = min(0.5 * min(ny, nx) * scale, 1.08 * float(reach) * scale)
-    norm = stretch(empty_sky_noise(products.noise), float(products.image.max()))
-    inside = np.where(products.mask, products.model, np.nan)
-    residual = np.where(products.mask, products.residual, np.nan)
-    for panel, values, title in zip(
-        axes, (products.image, inside, residual), ("data", "model", "residual"), strict=True
-    ):
+    norm = stretch(empty_sky_noise(plane.noise), float(plane.image.max()))
+    inside = np.where(plane.mask, plane.model, np.nan)
+    residual = np.where(plane.mask, plane.residual, np.nan)
+    for panel, values, title in zip(axes, (plane.image, inside, residual), ("data", "model", "residual"), strict=True):
         shown = show(panel, values, scale, norm, half)
         panel.set_facecolor("0.6")
         panel.set_title(title, fontsize=10)
@@ -70,16 +68,14 @@ def _images(figure: Figure, axes: list[Axes], products: Products) -> None:
 def _source(
     figure: Figure,
     axes: Axes,
-    products: Products,
+    plane: SourcePlane,
     values: FloatArray,
     title: str,
     norm: Normalize,
     label: str,
     cmap: str,
 ) -> None:
-    shown = axes.pcolormesh(
-        products.source_x_edges, products.source_y_edges, values, norm=norm, cmap=cmap, rasterized=True
-    )
+    shown = axes.pcolormesh(plane.source_x_edges, plane.source_y_edges, values, norm=norm, cmap=cmap, rasterized=True)
     axes.set_aspect("equal")
     axes.set_facecolor("0.6")
     axes.set_title(title, fontsize=10)
@@ -90,32 +86,32 @@ def _source(
 
 def _sources(figure: Figure, axes: list[Axes], view: InversionView) -> None:
     """Truth, source, its deviation, the share of the data and the width of the resolution."""
-    products, resolution = view.products, view.resolution
+    plane, resolution = view.source_plane, view.resolution
     truth_panel, source_panel, sd_panel, share_panel, width_panel = axes
-    norm = stretch(float(np.median(products.source_sd)), float(products.source.max()))
-    if products.source_truth is None:
+    norm = stretch(float(np.median(plane.source_sd)), float(plane.source.max()))
+    if plane.source_truth is None:
         truth_panel.set_axis_off()
     else:
         _source(
             figure,
             truth_panel,
-            products,
-            products.source_truth,
+            plane,
+            plane.source_truth,
             "source, truth",
             norm,
             f"{_BRIGHTNESS}, asinh",
             "inferno",
         )
-    _source(figure, source_panel, products, products.source, "source", norm, f"{_BRIGHTNESS}, asinh", "inferno")
-    spread = Normalize(0.0, float(products.source_sd.max()))
-    _source(figure, sd_panel, products, products.source_sd, "its standard deviation", spread, _BRIGHTNESS, "viridis")
+    _source(figure, source_panel, plane, plane.source, "source", norm, f"{_BRIGHTNESS}, asinh", "inferno")
+    spread = Normalize(0.0, float(plane.source_sd.max()))
+    _source(figure, sd_panel, plane, plane.source_sd, "its standard deviation", spread, _BRIGHTNESS, "viridis")
     share = Normalize(0.0, 1.0)
     _source(
-        figure, share_panel, products, resolution.data_share, "share of the data", share, "1: data, 0: prior", "viridis"
+        figure, share_panel, plane, resolution.data_share, "share of the data", share, "1: data, 0: prior", "viridis"
     )
     width = np.where(np.isfinite(resolution.width), resolution.width, np.nan)
     limits = Normalize(0.0, float(np.nanpercentile(width, 98.0)))
-    _source(figure, width_panel, products, width, "resolution", limits, "FWHM [arcsec]", "viridis_r")
+    _source(figure, width_panel, plane, width, "resolution", limits, "FWHM [arcsec]", "viridis_r")
 
 
 def _trace(axes: Axes, trace: EvidenceTrace) -> None:
@@ -155,7 +151,7 @@ def inversion_figure(view: InversionView) -> Figure:
     halves = figure.add_gridspec(2, 1, height_ratios=(7.0, 4.2))
     maps, below = figure.add_subfigure(halves[0]), figure.add_subfigure(halves[1])
     axes = maps.subplots(2, 4)
-    _images(figure, [axes[0, 0], axes[0, 1], axes[0, 2]], view.products)
+    _images(figure, [axes[0, 0], axes[0, 1], axes[0, 2]], view.image_plane)
     _sources(figure, [axes[0, 3], *axes[1]], view)
     panels = below.subplots(_TRACE_ROWS, -(-len(view.traces) // _TRACE_ROWS), squeeze=False)
     for panel in panels.flat[len(view.traces) :]:

@@ -67,9 +67,9 @@ def _source_panel(figure: Figure, axes: Axes, found: ImageMeasurement, half: flo
         axes.set_axis_off()
         axes.text(0.5, 0.5, "no inversion", ha="center", va="center", transform=axes.transAxes, fontsize=9)
         return
-    products = found.inversion.products
+    plane = found.inversion.source_plane
     shown = axes.pcolormesh(
-        products.source_x_edges, products.source_y_edges, products.source, norm=norm, cmap="inferno", rasterized=True
+        plane.source_x_edges, plane.source_y_edges, plane.source, norm=norm, cmap="inferno", rasterized=True
     )
     axes.set(xlim=(host.x - half, host.x + half), ylim=(host.y - half, host.y + half))
     axes.set_aspect("equal")
@@ -121,8 +121,8 @@ def measurement_figure(found: ImageMeasurement) -> Figure:
     _source_panel(figure, axes[1, 2], found, reach, bright)
     host = found.host
     figure.suptitle(
-        f"host {host.magnitude.mean:.2f} ± {host.magnitude.sd:.2f} mag, R {host.radius.mean:.3f} ± "
-        f"{host.radius.sd:.3f}″, n {host.n.mean:.2f} ± {host.n.sd:.2f} ({found.estimator});   "
+        f"host {host.magnitude.mean:.2f} ± {host.magnitude.sd:.2f} mag, R {host.r_eff.mean:.3f} ± "
+        f"{host.r_eff.sd:.3f}″, n {host.n.mean:.2f} ± {host.n.sd:.2f} ({found.estimator});   "
         f"$\\theta_E$ {fit.lens.theta_E:.3f}″, q {fit.lens.q:.2f}, slope {fit.lens.slope:.2f}, shear "
         f"{math.hypot(fit.lens.gamma1, fit.lens.gamma2):.3f};   status {found.status}",
         fontsize=10.5,

@@ -35,15 +35,15 @@ class Pictures:
 
     ``observation`` and ``model`` (NaN outside the mask) are (ny, nx) in e-/s, ``noise`` is that of the empty sky [e-/s
     per pixel]; ``source`` is (my, mx) in e-/s per arcsec^2 on cells with edges ``source_x_edges`` (mx + 1,) and
-    ``source_y_edges`` (my + 1,) [arcsec].
+    ``source_y_edges`` (my + 1,) [arcsec], all None for a run without an inversion.
     """
 
     observation: FloatArray
     model: FloatArray
     noise: float
-    source: FloatArray
-    source_x_edges: FloatArray
-    source_y_edges: FloatArray
+    source: FloatArray | None
+    source_x_edges: FloatArray | None
+    source_y_edges: FloatArray | None
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,14 @@ class Thumbnail:
 
 def pictures_of(products: Products) -> Pictures:
     """The pictures of a run from its arrays."""
+    image, source = products.image_plane, products.source_plane
     return Pictures(
-        observation=products.image,
-        model=np.where(products.mask, products.model, np.nan),
-        noise=empty_sky_noise(products.noise),
-        source=products.source,
-        source_x_edges=products.source_x_edges,
-        source_y_edges=products.source_y_edges,
+        observation=image.image,
+        model=np.where(image.mask, image.model, np.nan),
+        noise=empty_sky_noise(image.noise),
+        source=None if source is None else source.source,
+        source_x_edges=None if source is None else source.source_x_edges,
+        source_y_edges=None if source is None else source.source_y_edges,
     )
 
 
@@ -146,17 +147,19 @@ def _sky(axes: Axes, image: FloatArray, norm: AsinhNorm, left: float, top: float
 
 
 def _source(axes: Axes, pictures: Pictures, left: float, top: float) -> None:
-    """The source on its own, possibly uneven, grid, as large as the panel."""
-    x, y = pictures.source_x_edges, pictures.source_y_edges
+    """The source on its own, possibly uneven, grid, as large as the panel; a grey field where there is none."""
+    x, y, source = pictures.source_x_edges, pictures.source_y_edges, pictures.source
+    axes.add_patch(Rectangle((left, top), _SIDE, _SIDE, facecolor="0.6", zorder=0.0))
+    if x is None or y is None or source is None:
+        return
     reach = max(float(np.ptp(x)), float(np.ptp(y)))
     if not (math.isfinite(reach) and reach > 0.0):
         raise FigureError(f"source edges: got a width of {reach}, allowed is a positive one")
     # North is up, and y of the panel grows downwards.
     along = top + 0.5 * _SIDE - _SIDE * (y - 0.5 * (y[0] + y[-1])) / reach
     across = left + 0.5 * _SIDE + _SIDE * (x - 0.5 * (x[0] + x[-1])) / reach
-    peak = max(float(pictures.source.max()), 1e-12)
-    axes.add_patch(Rectangle((left, top), _SIDE, _SIDE, facecolor="0.6", zorder=0.0))
+    peak = max(float(source.max()), 1e-12)
     axes.pcolormesh(
-        across, along, pictures.source, cmap=_COLOURS, rasterized=True,
+        across, along, source, cmap=_COLOURS, rasterized=True,
         norm=AsinhNorm(linear_width=0.03 * peak, vmin=0.0, vmax=peak),
     )  # fmt: skip

@@ -1,12 +1,10 @@
 """The PSF of a drizzled image: a star taken through the same dithers and the same drizzle.
 
 Drizzling is not a convolution: the shape of a star depends a little on where it falls between the pixels. The
-PSF is therefore an average over such phases, and the spread between them is its model error.
+PSF is therefore an average over such phases.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import fft
@@ -24,36 +22,9 @@ _WHOLE_STEP = 2
 _GUARD = 4
 
 
-@dataclass(frozen=True, eq=False)
-class DrizzledPsf:
-    """PSF of a drizzled image.
-
-    Attributes
-    ----------
-    psf
-        Odd square, centred on its middle pixel, flux per drizzled pixel; its sum is the fraction of a star's
-        flux inside the stamp.
-    phase_error
-        Standard deviation over the phases, same shape and unit: what a star differs by from the PSF moved to
-        it by a Fourier shift. Drizzled pixels that undersample the star (ACS, scale ratio 1) are most of it.
-    oversampled
-        The same on a grid ``oversampling`` times finer, side 2 radius oversampling + 1, interlaced from the
-        phases: the flux that a drizzled pixel has at that offset from a star, over oversampling^2, so that
-        its sum is again the fraction of a star's flux. Every oversampling-th value times oversampling^2 is
-        one star of the average.
-    oversampling
-        Phases along each axis.
-    """
-
-    psf: FloatArray
-    phase_error: FloatArray
-    oversampled: FloatArray
-    oversampling: int
-
-
 def drizzled_psf(
     psf: FloatArray, geometry: Geometry, detector_kernel: FloatArray, radius: int, *, phases: int = 4
-) -> DrizzledPsf:
+) -> FloatArray:
     """PSF of the drizzled image that ``geometry`` describes, averaged over phases x phases star positions.
 
     Each star is placed, exposed and drizzled by the functions that make the images, moved back by its known
@@ -68,6 +39,10 @@ def drizzled_psf(
         smaller the outer part is zero.
     phases
         Star positions along each axis, 1 / phases of a drizzled pixel apart (modulo whole pixels).
+
+    Returns
+    -------
+    Odd square, centred on its middle pixel, flux per drizzled pixel; its sum is the fraction of a star's flux inside.
     """
     if radius < 1 or phases < 1:
         raise ObservationError(f"drizzled psf: got radius {radius} and {phases} phases, allowed are 1 and more")
@@ -77,7 +52,7 @@ def drizzled_psf(
     middle = np.array(wide.drizzled_shape) // 2
     origin = (np.array(wide.drizzled_shape) - 1) / 2
     stars = [(_WHOLE_STEP * i - reach // 2, i) for i in range(phases)]
-    moved, oversampled = [], np.zeros((2 * radius * phases + 1,) * 2)
+    moved = []
     for whole_y, i_y in stars:
         for whole_x, i_x in stars:
             row, column = middle[0] + whole_y, middle[1] + whole_x
@@ -85,13 +60,8 @@ def drizzled_psf(
             star = point_source_image(pixel * wide.drizzled_scale, np.ones(1), psf, wide)
             image = drizzle(expose(star, wide, detector_kernel), wide)
             stamp = _cut(image, row, column, radius + _GUARD)
-            # Pixel k of the inner part lies (k - radius) - i / phases pixels from the star.
-            first_y, first_x = int(i_y > 0), int(i_x > 0)
-            fine = oversampled[first_y * phases - i_y :: phases, first_x * phases - i_x :: phases]
-            fine[...] = stamp[_GUARD:-_GUARD, _GUARD:-_GUARD][first_y:, first_x:]
             moved.append(_shifted(stamp, -i_x / phases, -i_y / phases)[_GUARD:-_GUARD, _GUARD:-_GUARD])
-    cube = np.array(moved)
-    return DrizzledPsf(cube.mean(axis=0), cube.std(axis=0), oversampled / phases**2, phases)
+    return np.asarray(np.array(moved).mean(axis=0))
 
 
 def _cut(image: FloatArray, row: int, column: int, half: int) -> FloatArray:

@@ -26,7 +26,6 @@ from engine.imaging.geometry import Geometry
 
 _BALANCING_STEPS = 200
 _EVENNESS = 1e-4
-_SHARING_KERNELS = ("square", "turbo")
 
 
 def pixel_map(geometry: Geometry, index: int) -> FloatArray:
@@ -53,24 +52,20 @@ def _add(sum_: Drizzle, exposure: FloatArray, geometry: Geometry, index: int, we
     )
 
 
-def drizzle(exposures: FloatArray, geometry: Geometry, weights: FloatArray | None = None) -> FloatArray:
-    """Drizzle exposures onto the output grid, by the package in its single precision.
+def drizzle(exposures: FloatArray, geometry: Geometry) -> FloatArray:
+    """Drizzle exposures onto the output grid with :func:`even_weights`, by the package in its single precision.
 
     Parameters
     ----------
     exposures
         (n_dither, ny, nx) flux per native pixel.
-    weights
-        Weight maps of the same shape; those of :func:`even_weights` where None.
 
     Returns
     -------
     geometry.drizzled_shape, flux per drizzled pixel; NaN where no droplet falls.
     """
     _check_exposures(exposures, geometry)
-    if weights is not None and weights.shape != exposures.shape:
-        raise ObservationError(f"drizzle weights: got shape {weights.shape}, allowed is {exposures.shape}")
-    maps = even_weights(geometry) if weights is None else weights
+    maps = even_weights(geometry)
     total = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True)
     for index, exposure in enumerate(exposures):
         _add(total, exposure, geometry, index, maps[index])
@@ -88,8 +83,7 @@ def even_weights(geometry: Geometry) -> FloatArray:
     """Weight maps (n_dither, ny, nx) under which each native pixel well inside the image keeps its flux.
 
     Found by balancing W in the manner of Sinkhorn: its rows are weighted means whatever the weights, and the weights
-    are divided by what their pixels gain until none gains more than 1e-4. The point and Gaussian kernels, which do not
-    share out a pixel's flux in the first place, keep equal weights. Read-only; kept in memory.
+    are divided by what their pixels gain until none gains more than 1e-4. Read-only; kept in memory.
     """
     equal = _equal_weight_matrix(geometry)
     inside = np.stack([_well_inside(geometry, index) for index in range(geometry.n_dither)])
@@ -97,7 +91,7 @@ def even_weights(geometry: Geometry) -> FloatArray:
     flat, chosen = weights.reshape(-1), inside.ravel()
     rows = np.asarray(equal.sum(axis=1)).ravel()
     transposed = equal.T.tocsr()
-    for _ in range(_BALANCING_STEPS if geometry.kernel in _SHARING_KERNELS else 0):
+    for _ in range(_BALANCING_STEPS):
         gain = geometry.n_dither * flat * (transposed @ (rows / (equal @ flat)))
         if not chosen.any() or np.abs(gain[chosen] - 1.0).max() < _EVENNESS:
             break
@@ -132,20 +126,20 @@ def drizzle_weights(geometry: Geometry) -> sparse.csr_matrix:
 def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
     """W with equal weights.
 
-    Found by drizzling combs of impulses so far apart that their footprints cannot touch; for each exposure apart,
-    then put together as the package does, by the weights it reports.
+    Found by drizzling images of single bright pixels, so far apart that no two reach the same drizzled pixel; each
+    exposure by itself, then put together as the package does, by the weights it reports.
     """
-    step = _comb_step(geometry)
+    step = _impulse_spacing(geometry)
     weight_sum = np.zeros(geometry.drizzled_shape)
     rows, columns, values = [], [], []
     n_native = math.prod(geometry.native_shape)
     for index in range(geometry.n_dither):
         nearest = [_nearest(axis, geometry, index, step) for axis in (0, 1)]
         for j, i in np.ndindex(step, step):
-            comb = np.zeros(geometry.native_shape)
-            comb[j::step, i::step] = 1.0
+            impulses = np.zeros(geometry.native_shape)
+            impulses[j::step, i::step] = 1.0
             one = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True, fillval=0.0)
-            _add(one, comb, geometry, index, None)
+            _add(one, impulses, geometry, index, None)
             weight = np.asarray(one.out_wht, dtype=np.float64)
             product = np.asarray(one.out_img, dtype=np.float64) * weight
             row, column = np.nonzero(product)
@@ -153,7 +147,7 @@ def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
             source = nearest[0][i][column] + geometry.native_shape[1] * nearest[1][j][row]
             columns.append(index * n_native + source)
             values.append(product[row, column])
-        weight_sum += weight  # every comb of an exposure reports the same weights
+        weight_sum += weight  # every image of an exposure reports the same weights
     matrix = sparse.coo_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
         shape=(math.prod(geometry.drizzled_shape), geometry.n_dither * n_native),
@@ -165,37 +159,25 @@ def _equal_weight_matrix(geometry: Geometry) -> sparse.csr_matrix:
     return matrix
 
 
-def _comb_step(geometry: Geometry) -> int:
+def _impulse_spacing(geometry: Geometry) -> int:
     """Distance in native pixels at which the footprints of two impulses share no drizzled pixel.
 
-    A droplet is pixfrac wide (the Gaussian kernel is cut at 2.5 sigma, 2.2 pixfrac) and reaches every
-    drizzled pixel that it touches, or at least the nearest one.
+    A droplet is pixfrac wide and reaches every drizzled pixel that it touches, or at least the nearest one.
     """
     return math.ceil(2.2 * geometry.pixfrac + geometry.drizzle_ratio) + 1
 
 
 def _nearest(axis: int, geometry: Geometry, index: int, step: int) -> list[np.ndarray[tuple[int], np.dtype[np.intp]]]:
-    """Find, for each phase of the comb, the native index of the tooth nearest to every drizzled pixel.
-
-    Axis 0 is x.
-    """
+    """Native index of the impulse nearest to every drizzled pixel, for each place of the first; axis 0 is x."""
     native, drizzled = geometry.native_axes(index)[axis], geometry.drizzled_axes()[axis]
     n = len(native)
     position = (drizzled - native[0]) / geometry.pixel_scale
     result = []
     for phase in range(step):
-        teeth = (n - 1 - phase) // step
-        tooth = np.clip(np.rint((position - phase) / step), 0, max(teeth, 0))
-        result.append((phase + step * tooth).astype(np.intp))
+        last = (n - 1 - phase) // step
+        impulse = np.clip(np.rint((position - phase) / step), 0, max(last, 0))
+        result.append((phase + step * impulse).astype(np.intp))
     return result
-
-
-def drizzled_variance(variance: FloatArray, geometry: Geometry) -> FloatArray:
-    """Variance of every drizzled pixel, of geometry.drizzled_shape, from that of the exposures: (W o W) v."""
-    _check_exposures(variance, geometry)
-    weights = drizzle_weights(geometry)
-    squared = sparse.csr_matrix((weights.data**2, weights.indices, weights.indptr), shape=weights.shape)
-    return np.asarray(squared @ variance.ravel()).reshape(geometry.drizzled_shape)
 
 
 def drizzled_covariance(variance: FloatArray, geometry: Geometry) -> sparse.csr_matrix:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from astropy.stats import sigma_clip
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass as validated_dataclass
@@ -22,7 +23,6 @@ from engine.imaging.observation import Observation, Provenance, image_array
 
 PsfCentre = Literal["pixel", "peak", "centroid"]
 _CLIP_SIGMA = 3.0
-_CLIP_STEPS = 50
 _SKY_WINDOW = 11
 _FAINTEST_PERCENT = 25.0
 _SMALLEST_SKY = 400
@@ -176,12 +176,7 @@ def noise_from_image(image: FloatArray, how: NoiseFromImage) -> NoiseEstimate:
 
 def _clipped_rms(values: FloatArray) -> float:
     """Standard deviation after clipping at 3 sigma about the median until nothing more goes."""
-    for _ in range(_CLIP_STEPS):
-        middle, rms = float(np.median(values)), float(values.std())
-        kept = values[np.abs(values - middle) <= _CLIP_SIGMA * rms]
-        if kept.size == values.size:
-            break
-        values = kept
+    rms = float(sigma_clip(values, sigma=_CLIP_SIGMA, maxiters=None, masked=False).std())
     if not rms > 0:
         raise ObservationError(f"image: its sky has the rms {rms}, allowed is a positive one")
     return rms

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from astropy.wcs import WCS
 from scipy import sparse
 
 from engine.errors import ObservationError
 from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
-from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.exposed import ExposedOptics
 
 FORMAT_VERSION = 2
 _KEYWORD = re.compile(r"[A-Z][A-Z0-9_-]{0,7}")
@@ -70,28 +71,17 @@ def _fits_on_a_card(value: str | float | int) -> bool:
 
 def _world_coordinates(observation: Observation) -> fits.Header:
     ny, nx = observation.shape
-    centre = observation.centre
-    header = fits.Header()
-    for axis, n in ((1, nx), (2, ny)):
-        header[f"CRPIX{axis}"] = (n + 1) / 2  # FITS counts pixels from 1
-    if centre is None:
-        for axis, name in ((1, "X"), (2, "Y")):
-            header[f"CTYPE{axis}"] = name
-            header[f"CUNIT{axis}"] = "arcsec"
-            header[f"CRVAL{axis}"] = 0.0
-            header[f"CDELT{axis}"] = observation.pixel_scale
-        return header
-    degrees = observation.pixel_scale / 3600
-    for axis, name, value, step in (
-        (1, "RA---TAN", centre[0], -degrees),
-        (2, "DEC--TAN", centre[1], degrees),
-    ):
-        header[f"CTYPE{axis}"] = name
-        header[f"CUNIT{axis}"] = "deg"
-        header[f"CRVAL{axis}"] = value
-        header[f"CDELT{axis}"] = step
-    header["RADESYS"] = "ICRS"
-    return header
+    world = WCS(naxis=2)
+    world.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]  # FITS counts pixels from 1
+    if observation.centre is None:
+        world.wcs.ctype, world.wcs.cunit = ["X", "Y"], ["arcsec", "arcsec"]
+        world.wcs.cdelt = [observation.pixel_scale, observation.pixel_scale]
+    else:
+        degrees = observation.pixel_scale / 3600
+        world.wcs.ctype, world.wcs.cunit = ["RA---TAN", "DEC--TAN"], ["deg", "deg"]
+        world.wcs.crval, world.wcs.cdelt = observation.centre, [-degrees, degrees]
+        world.wcs.radesys = "ICRS"
+    return world.to_header()
 
 
 def _covariance_table(covariance: sparse.csr_matrix) -> fits.BinTableHDU:
@@ -107,7 +97,7 @@ def _covariance_table(covariance: sparse.csr_matrix) -> fits.BinTableHDU:
     )
 
 
-def _exposures(response: PointResponse) -> fits.ImageHDU:
+def _exposures(response: ExposedOptics) -> fits.ImageHDU:
     """The optical PSF on sub-pixels, with sampling and detector kernel as JSON text in its header."""
     plane = fits.ImageHDU(response.psf, name="EXPOSURES")
     plane.header["LONGSTRN"] = "OGIP 1.0"
@@ -116,7 +106,7 @@ def _exposures(response: PointResponse) -> fits.ImageHDU:
     return plane
 
 
-def _response(plane: fits.ImageHDU) -> PointResponse:
+def _response(plane: fits.ImageHDU) -> ExposedOptics:
     values = json.loads(plane.header["SAMPLING"])
     try:
         # JSON has lists where the geometry has tuples, on which its hash depends.
@@ -124,7 +114,7 @@ def _response(plane: fits.ImageHDU) -> PointResponse:
         geometry = Geometry(**tuples)
     except TypeError as error:
         raise ObservationError(f"EXPOSURES: its sampling is not of this layout ({error})") from error
-    return PointResponse(plane.data.astype(np.float64), geometry, np.array(json.loads(plane.header["DETECTOR"])))
+    return ExposedOptics(plane.data.astype(np.float64), geometry, np.array(json.loads(plane.header["DETECTOR"])))
 
 
 def _tuples(value: Any) -> Any:

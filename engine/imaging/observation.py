@@ -12,8 +12,9 @@ from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
-from engine.imaging.optics.exposed import PointResponse
-from engine.imaging.optics.spline import place_stamp
+from engine.imaging.optics.exposed import ExposedOptics
+from engine.imaging.optics.interface import ImageOptics
+from engine.imaging.optics.stamp import StampOptics
 
 Provenance = Mapping[str, str | float | int]
 
@@ -56,7 +57,7 @@ class Observation:
     covariance: sparse.csr_matrix | None = None
     valid: NDArray[np.bool_] = None  # type: ignore[assignment]  # never None after __post_init__
     provenance: Provenance = field(default_factory=dict)
-    response: PointResponse | None = None
+    response: ExposedOptics | None = None
     centre: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -123,13 +124,14 @@ class Observation:
         ny, nx = self.image.shape
         return ny, nx
 
+    @property
+    def optics(self) -> ImageOptics:
+        """What light becomes in this image: through its exposures where they are known, through the stamp otherwise."""
+        return self.response or StampOptics(self.psf, self.shape, self.pixel_scale)
+
     def point_source(self, x: float, y: float) -> FloatArray:
         """Image (ny, nx) of a point source of unit flux at (x, y) [arcsec, image frame]."""
-        if self.response is not None:
-            return self.response.image(x, y)
-        ny, nx = self.shape
-        column, row = x / self.pixel_scale + (nx - 1) / 2.0, y / self.pixel_scale + (ny - 1) / 2.0
-        return place_stamp(self.psf, self.shape, column, row)
+        return self.optics.point_source(x, y)
 
 
 def image_array(name: str, values: ArrayLike) -> FloatArray:

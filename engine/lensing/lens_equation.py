@@ -17,10 +17,11 @@ from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import LensEquationError
 from engine.lensing.power_law import (
+    LensConstants,
     PowerLawLens,
     deflect_point,
     jacobian_point,
-    kernel_arguments,
+    lens_constants,
     magnification,
 )
 
@@ -46,24 +47,24 @@ class LensedImage:
 
 
 @inlined_kernel
-def _determinant(x: float, y: float, p: FloatArray, a: FloatArray) -> float:
+def _determinant(x: float, y: float, lens: LensConstants) -> float:
     """Determinant of the Jacobian of the lens equation: the inverse magnification."""
-    kappa, g1, g2 = jacobian_point(x, y, p, a)
+    kappa, g1, g2 = jacobian_point(x, y, lens)
     return (1.0 - kappa) ** 2 - g1 * g1 - g2 * g2
 
 
 @kernel
-def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArray) -> tuple[float, float, bool]:
-    """Damped Newton on the lens equation; whether it converged to rounding."""
-    ax, ay = deflect_point(x, y, p, a)
+def _polish(x: float, y: float, sx: float, sy: float, lens: LensConstants) -> tuple[float, float, bool]:
+    """Damped Newton from (x, y) to an image of the source (sx, sy) [arcsec]; whether it converged to rounding."""
+    ax, ay = deflect_point(x, y, lens)
     fx, fy = x - ax - sx, y - ay - sy
     error = math.hypot(fx, fy)
     for _ in range(_NEWTON_STEPS):
         if error < 1e-14:
             break
-        if x == p[5] and y == p[6]:
+        if x == lens.x and y == lens.y:
             return x, y, False
-        kappa, g1, g2 = jacobian_point(x, y, p, a)
+        kappa, g1, g2 = jacobian_point(x, y, lens)
         determinant = (1.0 - kappa) ** 2 - g1 * g1 - g2 * g2
         if determinant == 0.0:
             return x, y, False
@@ -73,7 +74,7 @@ def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArr
         improved = False
         for _ in range(30):
             nx, ny = x - damping * step_x, y - damping * step_y
-            ax, ay = deflect_point(nx, ny, p, a)
+            ax, ay = deflect_point(nx, ny, lens)
             gx, gy = nx - ax - sx, ny - ay - sy
             trial = math.hypot(gx, gy)
             if trial < error:
@@ -87,22 +88,22 @@ def _polish(x: float, y: float, sx: float, sy: float, p: FloatArray, a: FloatArr
 
 
 @inlined_kernel
-def _is_coarse(x: float, y: float, side: float, theta_E: float, p: FloatArray) -> bool:
+def _is_coarse(x: float, y: float, side: float, theta_E: float, lens: LensConstants) -> bool:
     """Whether a cell is large against its distance from the lens, on whose scale the deflection varies."""
-    distance = max(math.hypot(x - p[5], y - p[6]) - 0.71 * side, _CORE * theta_E)
-    return side > _COARSE * math.sqrt(p[1]) * distance
+    distance = max(math.hypot(x - lens.x, y - lens.y) - 0.71 * side, _CORE * theta_E)
+    return side > _COARSE * math.sqrt(lens.q) * distance
 
 
 @kernel
-def _map_cell(x: float, y: float, side: float, sx: float, sy: float, p: FloatArray, a: FloatArray) -> tuple[bool, bool]:
+def _map_cell(x: float, y: float, side: float, sx: float, sy: float, lens: LensConstants) -> tuple[bool, bool]:
     """Whether the source may lie in a mapped cell, and whether the cell is simple: nearly linear, of one parity."""
-    ax, ay = deflect_point(x, y, p, a)
+    ax, ay = deflect_point(x, y, lens)
     cx, cy = x - ax, y - ay
     corners = np.empty((4, 2))
     longest, long_x, long_y = 0.0, 1.0, 0.0
     for k in range(4):
         u, v = x + ((k % 2) - 0.5) * side, y + ((k // 2) - 0.5) * side
-        ax, ay = deflect_point(u, v, p, a)
+        ax, ay = deflect_point(u, v, lens)
         dx, dy = u - ax - cx, v - ay - cy
         corners[k, 0], corners[k, 1] = dx, dy
         length = math.hypot(dx, dy)
@@ -123,9 +124,9 @@ def _map_cell(x: float, y: float, side: float, sx: float, sy: float, p: FloatArr
     across = abs((sy - cy) * long_x - (sx - cx) * long_y)
     if along > 1.05 * extent_along + 2.0 * bend or across > 1.05 * extent_across + 2.0 * bend:
         return False, False
-    low = high = _determinant(x, y, p, a)
+    low = high = _determinant(x, y, lens)
     for k in range(4):
-        value = _determinant(x + ((k % 2) - 0.5) * side, y + ((k // 2) - 0.5) * side, p, a)
+        value = _determinant(x + ((k % 2) - 0.5) * side, y + ((k // 2) - 0.5) * side, lens)
         low, high = min(low, value), max(high, value)
     spread = high - low
     one_parity = low - 0.5 * spread > 0.0 or high + 0.5 * spread < 0.0
@@ -133,22 +134,20 @@ def _map_cell(x: float, y: float, side: float, sx: float, sy: float, p: FloatArr
 
 
 @kernel
-def _candidates(
-    sx: float, sy: float, half: float, theta_E: float, p: FloatArray, a: FloatArray, found: FloatArray
-) -> int:
-    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many there are."""
+def _candidates(sx: float, sy: float, half: float, theta_E: float, lens: LensConstants, found: FloatArray) -> int:
+    """Cells that may hold images: centre and side [arcsec], written into ``found`` (n, 3); how many there are."""
     stack = np.empty((512, 4))
     # Off the lens by an irrational part, so that no corner and no centre ever falls on it.
-    stack[0, 0], stack[0, 1] = p[5] + 0.0318309886 * half, p[6] + 0.0271828183 * half
+    stack[0, 0], stack[0, 1] = lens.x + 0.0318309886 * half, lens.y + 0.0271828183 * half
     stack[0, 2], stack[0, 3] = 2.1 * half, 0.0
     top = 1
     n = 0
     while top > 0:
         top -= 1
         x, y, side, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-        cut = _is_coarse(x, y, side, theta_E, p)
+        cut = _is_coarse(x, y, side, theta_E, lens)
         if not cut:
-            near, simple = _map_cell(x, y, side, sx, sy, p, a)
+            near, simple = _map_cell(x, y, side, sx, sy, lens)
             if not near:
                 continue
             cut = not simple and depth < _DEPTH
@@ -168,23 +167,23 @@ def _candidates(
 
 @kernel
 def _images(
-    candidates: FloatArray, sx: float, sy: float, theta_E: float, p: FloatArray, a: FloatArray, roots: FloatArray
+    candidates: FloatArray, sx: float, sy: float, theta_E: float, lens: LensConstants, roots: FloatArray
 ) -> int:
-    """Distinct images reached from the candidate cells, written into ``roots`` (n, 2); how many."""
+    """Distinct images [arcsec] reached from the candidate cells, written into ``roots`` (n, 2); how many."""
     n = 0
     for c in range(candidates.shape[0]):
         for k in range(5):
             shift = 0.0 if k == 4 else 0.5 * candidates[c, 2]
             x0 = candidates[c, 0] + (2 * (k % 2) - 1) * shift
             y0 = candidates[c, 1] + (2 * (k // 2 % 2) - 1) * shift
-            x, y, converged = _polish(x0, y0, sx, sy, p, a)
+            x, y, converged = _polish(x0, y0, sx, sy, lens)
             if not converged:
                 continue
             known = False
-            determinant = _determinant(x, y, p, a)
+            determinant = _determinant(x, y, lens)
             for m in range(n):
                 distance = math.hypot(x - roots[m, 0], y - roots[m, 1])
-                other = _determinant(roots[m, 0], roots[m, 1], p, a)
+                other = _determinant(roots[m, 0], roots[m, 1], lens)
                 # On a caustic Newton stops anywhere within the square root of rounding of a double root.
                 blurred = distance < 1e-5 * theta_E and determinant * other > 0.0 and abs(determinant) < 1e-4
                 known = known or blurred or distance < 1e-7 * theta_E
@@ -213,7 +212,7 @@ def solve_lens_equation(
     LensEquationError
         No image was found; a source always has one at least.
     """
-    p, a = kernel_arguments(lens)
+    constants = lens_constants(lens)
     offset = math.hypot(source_x - lens.x, source_y - lens.y)
     shear = math.hypot(lens.gamma1, lens.gamma2)
     if shear >= 1.0:
@@ -226,11 +225,11 @@ def solve_lens_equation(
         if half > 1e4 * reach + 10.0 * offset:
             raise LensEquationError(f"slope {lens.slope} and shear {shear} leave the image plane unbounded")
     cells = np.empty((_MOST_CELLS, 3))
-    n = _candidates(source_x, source_y, half, lens.theta_E, p, a, cells)
+    n = _candidates(source_x, source_y, half, lens.theta_E, constants, cells)
     if n > _MOST_CELLS:
         raise LensEquationError(f"the source at ({source_x}, {source_y}) behind {lens} is too close to a caustic")
     found = np.empty((16, 2))
-    roots = found[: _images(cells[:n], source_x, source_y, lens.theta_E, p, a, found)]
+    roots = found[: _images(cells[:n], source_x, source_y, lens.theta_E, constants, found)]
     images = []
     for x, y in roots:
         mu = float(magnification(lens, np.array(x), np.array(y)))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,46 +81,64 @@ def series_coefficients(q: float, t: float, tolerance: float = SERIES_TOLERANCE)
     return np.array(coefficients)
 
 
-def kernel_arguments(lens: PowerLawLens) -> tuple[FloatArray, FloatArray]:
-    """What the compiled kernels take: packed parameters and series coefficients."""
-    t = lens.slope - 1.0
-    packed = np.array(
-        [
-            lens.theta_E * math.sqrt(lens.q),
-            lens.q,
-            math.cos(lens.phi),
-            math.sin(lens.phi),
-            t,
-            lens.x,
-            lens.y,
-            lens.gamma1,
-            lens.gamma2,
-        ]
+class LensConstants(NamedTuple):
+    """A lens as the compiled kernels take it.
+
+    ``b`` is theta_E sqrt(q) [arcsec], (``cos``, ``sin``) those of phi, ``t`` is slope - 1, ``x`` and ``y`` the centre
+    [arcsec], ``gamma1`` and ``gamma2`` the shear, ``series`` (k,) the coefficients of the deflection.
+    """
+
+    b: float
+    q: float
+    cos: float
+    sin: float
+    t: float
+    x: float
+    y: float
+    gamma1: float
+    gamma2: float
+    series: FloatArray
+
+
+def lens_constants(lens: PowerLawLens) -> LensConstants:
+    """The constants of a lens."""
+    t = float(lens.slope - 1.0)
+    # A whole number would be another type to the kernels.
+    return LensConstants(
+        b=lens.theta_E * math.sqrt(lens.q),
+        q=float(lens.q),
+        cos=math.cos(lens.phi),
+        sin=math.sin(lens.phi),
+        t=t,
+        x=float(lens.x),
+        y=float(lens.y),
+        gamma1=float(lens.gamma1),
+        gamma2=float(lens.gamma2),
+        series=series_coefficients(lens.q, t),
     )
-    return packed, series_coefficients(lens.q, t)
 
 
 @inlined_kernel
-def deflect_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float]:
-    """Deflection (alpha_x, alpha_y) [arcsec] at one point; ``p`` and ``a`` from :func:`kernel_arguments`.
+def deflect_point(x: float, y: float, lens: LensConstants) -> tuple[float, float]:
+    """Deflection (alpha_x, alpha_y) [arcsec] at one point; ``lens`` from :func:`lens_constants`.
 
     At the centre of the lens the symmetric value, zero, is returned.
     """
-    b, q, c, s, t = p[0], p[1], p[2], p[3], p[4]
-    dx, dy = x - p[5], y - p[6]
+    b, q, c, s, t = lens.b, lens.q, lens.cos, lens.sin, lens.t
+    dx, dy = x - lens.x, y - lens.y
     u = q * (c * dx + s * dy)
     v = c * dy - s * dx
     r2 = u * u + v * v
-    shear_x = p[7] * x + p[8] * y
-    shear_y = p[8] * x - p[7] * y
+    shear_x = lens.gamma1 * x + lens.gamma2 * y
+    shear_y = lens.gamma2 * x - lens.gamma1 * y
     if r2 == 0.0:
         return shear_x, shear_y
     r = math.sqrt(r2)
     cos1, sin1 = u / r, v / r
     wr, wi = cos1 * cos1 - sin1 * sin1, 2.0 * cos1 * sin1
-    sr, si = a[a.size - 1], 0.0
-    for k in range(a.size - 2, -1, -1):
-        sr, si = a[k] + sr * wr - si * wi, sr * wi + si * wr
+    sr, si = lens.series[lens.series.size - 1], 0.0
+    for k in range(lens.series.size - 2, -1, -1):
+        sr, si = lens.series[k] + sr * wr - si * wi, sr * wi + si * wr
     scale = 2.0 * b / (1.0 + q)
     if t != 1.0:
         scale *= (b / r) ** (t - 1.0)
@@ -129,14 +148,12 @@ def deflect_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[flo
 
 
 @inlined_kernel
-def _map_rays(
-    x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray, traced: bool
-) -> None:
+def _map_rays(x: FloatArray, y: FloatArray, lens: LensConstants, bx: FloatArray, by: FloatArray, traced: bool) -> None:
     """Source positions (``traced``) or deflections of image positions, written into ``bx`` and ``by``.
 
     Works in blocks whose loops over points are innermost, so that the compiler can vectorise the series.
     """
-    b, q, c, s, t = p[0], p[1], p[2], p[3], p[4]
+    b, q, c, s, t = lens.b, lens.q, lens.cos, lens.sin, lens.t
     scale0 = 2.0 * b / (1.0 + q)
     cos1 = np.empty(_BLOCK)
     sin1 = np.empty(_BLOCK)
@@ -148,7 +165,7 @@ def _map_rays(
     for start in range(0, x.size, _BLOCK):
         m = min(_BLOCK, x.size - start)
         for i in range(m):
-            dx, dy = x[start + i] - p[5], y[start + i] - p[6]
+            dx, dy = x[start + i] - lens.x, y[start + i] - lens.y
             u = q * (c * dx + s * dy)
             v = c * dy - s * dx
             r = math.sqrt(u * u + v * v)
@@ -160,10 +177,10 @@ def _map_rays(
             sin1[i] = v
             wr[i] = u * u - v * v
             wi[i] = 2.0 * u * v
-            sr[i] = a[a.size - 1]
+            sr[i] = lens.series[lens.series.size - 1]
             si[i] = 0.0
-        for k in range(a.size - 2, -1, -1):
-            ak = a[k]
+        for k in range(lens.series.size - 2, -1, -1):
+            ak = lens.series[k]
             for i in range(m):
                 re = ak + sr[i] * wr[i] - si[i] * wi[i]
                 si[i] = sr[i] * wi[i] + si[i] * wr[i]
@@ -178,38 +195,39 @@ def _map_rays(
             ar = radius[i] * (cos1[i] * sr[i] - sin1[i] * si[i])
             ai = radius[i] * (cos1[i] * si[i] + sin1[i] * sr[i])
             xi, yi = x[start + i], y[start + i]
-            alpha_x = c * ar - s * ai + p[7] * xi + p[8] * yi
-            alpha_y = s * ar + c * ai + p[8] * xi - p[7] * yi
+            alpha_x = c * ar - s * ai + lens.gamma1 * xi + lens.gamma2 * yi
+            alpha_y = s * ar + c * ai + lens.gamma2 * xi - lens.gamma1 * yi
             bx[start + i] = xi - alpha_x if traced else alpha_x
             by[start + i] = yi - alpha_y if traced else alpha_y
 
 
 @kernel
-def trace_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, bx: FloatArray, by: FloatArray) -> None:
-    """Source positions of image positions, written into ``bx`` and ``by`` (all one-dimensional, same length)."""
-    _map_rays(x, y, p, a, bx, by, True)
+def trace_rays(x: FloatArray, y: FloatArray, lens: LensConstants, bx: FloatArray, by: FloatArray) -> None:
+    """Source positions of image positions, written into ``bx`` and ``by``; all (k,), in arcsec."""
+    _map_rays(x, y, lens, bx, by, True)
 
 
 @kernel
-def _deflect_rays(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, ax: FloatArray, ay: FloatArray) -> None:
+def _deflect_rays(x: FloatArray, y: FloatArray, lens: LensConstants, ax: FloatArray, ay: FloatArray) -> None:
+    """Deflections [arcsec] at image positions (k,) [arcsec], written into ``ax`` and ``ay`` (k,)."""
     # Not x - (x - alpha): far from the lens that would lose the digits of alpha.
-    _map_rays(x, y, p, a, ax, ay, False)
+    _map_rays(x, y, lens, ax, ay, False)
 
 
 @inlined_kernel
-def jacobian_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[float, float, float]:
+def jacobian_point(x: float, y: float, lens: LensConstants) -> tuple[float, float, float]:
     """Convergence and shear (kappa, g1, g2) at one point; at the centre of the lens kappa is infinite.
 
     The deflection is homogeneous of degree 1 - t, so z kappa + z* gamma = (1 - t) alpha (Euler), which gives the
     shear from kappa and alpha without differences.
     """
-    b, q, c, s, t = p[0], p[1], p[2], p[3], p[4]
-    dx, dy = x - p[5], y - p[6]
+    b, q, c, s, t = lens.b, lens.q, lens.cos, lens.sin, lens.t
+    dx, dy = x - lens.x, y - lens.y
     if dx == 0.0 and dy == 0.0:
-        return np.inf, p[7], p[8]
-    ax, ay = deflect_point(x, y, p, a)
-    ax -= p[7] * x + p[8] * y
-    ay -= p[8] * x - p[7] * y
+        return np.inf, lens.gamma1, lens.gamma2
+    ax, ay = deflect_point(x, y, lens)
+    ax -= lens.gamma1 * x + lens.gamma2 * y
+    ay -= lens.gamma2 * x - lens.gamma1 * y
     u = q * (c * dx + s * dy)
     v = c * dy - s * dx
     kappa = 0.5 * (2.0 - t) * (b / math.sqrt(u * u + v * v)) ** t
@@ -217,13 +235,14 @@ def jacobian_point(x: float, y: float, p: FloatArray, a: FloatArray) -> tuple[fl
     # gamma = [(1 - t) alpha - z kappa] / z*  =  [(1 - t) alpha - z kappa] z / |z|^2
     re = (1.0 - t) * ax - dx * kappa
     im = (1.0 - t) * ay - dy * kappa
-    return kappa, (re * dx - im * dy) / r2 + p[7], (re * dy + im * dx) / r2 + p[8]
+    return kappa, (re * dx - im * dy) / r2 + lens.gamma1, (re * dy + im * dx) / r2 + lens.gamma2
 
 
 @kernel
-def _convergence_and_shear(x: FloatArray, y: FloatArray, p: FloatArray, a: FloatArray, out: FloatArray) -> None:
+def _convergence_and_shear(x: FloatArray, y: FloatArray, lens: LensConstants, out: FloatArray) -> None:
+    """Convergence and shear components at image positions (k,) [arcsec], written into ``out`` (3, k)."""
     for i in range(x.size):
-        out[0, i], out[1, i], out[2, i] = jacobian_point(x[i], y[i], p, a)
+        out[0, i], out[1, i], out[2, i] = jacobian_point(x[i], y[i], lens)
 
 
 def _flat(x: FloatArray, y: FloatArray) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
@@ -236,7 +255,7 @@ def deflection(lens: PowerLawLens, x: FloatArray, y: FloatArray) -> tuple[FloatA
     """Deflection angles [arcsec] at image positions [arcsec]; arrays of any one shape."""
     shape, x, y = _flat(x, y)
     ax, ay = np.empty(x.size), np.empty(x.size)
-    _deflect_rays(x, y, *kernel_arguments(lens), ax, ay)
+    _deflect_rays(x, y, lens_constants(lens), ax, ay)
     return ax.reshape(shape), ay.reshape(shape)
 
 
@@ -244,7 +263,7 @@ def source_position(lens: PowerLawLens, x: FloatArray, y: FloatArray) -> tuple[F
     """Source-plane positions [arcsec] of image positions [arcsec]; arrays of any one shape."""
     shape, x, y = _flat(x, y)
     bx, by = np.empty(x.size), np.empty(x.size)
-    trace_rays(x, y, *kernel_arguments(lens), bx, by)
+    trace_rays(x, y, lens_constants(lens), bx, by)
     return bx.reshape(shape), by.reshape(shape)
 
 
@@ -254,7 +273,7 @@ def convergence_and_shear(
     """Convergence and total shear components at image positions; at the centre of the lens the first is infinite."""
     shape, x, y = _flat(x, y)
     out = np.empty((3, x.size))
-    _convergence_and_shear(x, y, *kernel_arguments(lens), out)
+    _convergence_and_shear(x, y, lens_constants(lens), out)
     return out[0].reshape(shape), out[1].reshape(shape), out[2].reshape(shape)
 
 

@@ -1,7 +1,7 @@
 """Sersic profiles as functions of six shape parameters, with their derivatives, averaged over cells.
 
-The parameters are (ln r_eff, e1, e2, x, y, n), with e = (1 - q)/(1 + q) and (e1, e2) = e (cos 2 phi, sin 2 phi):
-nothing is singular where the profile is round. Brightness is for unit flux; the flux is solved for elsewhere.
+The parameters are those of :data:`engine.light.sersic.SHAPE`: nothing is singular where the profile is round.
+Brightness is for unit flux; the flux is solved for elsewhere.
 
 A cell is a parallelogram. Far from the centre of the profile four points (2 x 2 Gauss-Legendre) give its mean; nearer
 it is cut into four, level by level, so that the cusp costs a few hundred points wherever it lies.
@@ -10,17 +10,18 @@ it is cut into four, level by level, so that the cusp costs a few hundred points
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
-from engine.light.sersic import SersicProfile, sersic_k, sersic_normalisation
+from engine.light.sersic import SHAPE, SersicProfile, sersic_k, sersic_normalisation, shape_of
 
-PARAMETERS = ("ln_r_eff", "e1", "e2", "x", "y", "n")
-LN_R_EFF, E1, E2, X, Y, N = range(len(PARAMETERS))
-COLUMNS = len(PARAMETERS) + 1
+LN_R_EFF, N, E1, E2, X, Y = range(len(SHAPE))
+BRIGHTNESS = len(SHAPE)
+COLUMNS = BRIGHTNESS + 1
 """Derivatives by each parameter, then the brightness itself."""
 
 MAX_ELLIPTICITY = 0.6
@@ -37,76 +38,78 @@ _STACK = 3 * _MAX_DEPTH + 4
 _GAUSS = 1.0 / math.sqrt(3.0)
 
 
-def shape_of(profile: SersicProfile) -> FloatArray:
-    """The six parameters of a profile."""
-    e = (1.0 - profile.q) / (1.0 + profile.q)
-    angle = 2.0 * profile.phi
-    return np.array(
-        [math.log(profile.r_eff), e * math.cos(angle), e * math.sin(angle), profile.x, profile.y, profile.n]
-    )
+class ShapeConstants(NamedTuple):
+    """A shape as the kernels take it: I = central exp(-k z^half_inverse_n), z = R^2 inverse_r2.
 
-
-def profile_of(shape: FloatArray, flux: float) -> SersicProfile:
-    """The profile of six parameters and a flux [e-/s]."""
-    ln_r, e1, e2, x, y, n = (float(value) for value in shape)
-    e = math.hypot(e1, e2)
-    return SersicProfile(flux, math.exp(ln_r), n, (1.0 - e) / (1.0 + e), 0.5 * math.atan2(e2, e1), x, y)
-
-
-def shape_arguments(shape: FloatArray) -> FloatArray:
-    """Packed constants of a shape for the kernels.
-
-    I_0, k, 1/(2n), 1/r_eff^2, e1, e2, x, y, d ln I_0/dn, dk/dn, n, 1 + e^2, 1/(1 - e^2), radius of the core.
+    ``ln_central_by_n`` and ``k_by_n`` are derivatives; ``stretch`` is 1 + e^2 and ``squeeze`` 1 / (1 - e^2);
+    ``core`` is the radius of the core [arcsec].
     """
-    ln_r, e1, e2, x, y, n = (float(value) for value in shape)
+
+    central: float
+    k: float
+    half_inverse_n: float
+    inverse_r2: float
+    e1: float
+    e2: float
+    x: float
+    y: float
+    ln_central_by_n: float
+    k_by_n: float
+    n: float
+    stretch: float
+    squeeze: float
+    core: float
+
+
+def shape_constants(shape: FloatArray) -> ShapeConstants:
+    """The constants of a shape (6,)."""
+    ln_r, n, e1, e2, x, y = (float(value) for value in shape)
     radius, step = math.exp(ln_r), _INDEX_STEP * n
-    k, i0 = sersic_k(n), sersic_normalisation(n, radius)
-    rise_i0 = math.log(sersic_normalisation(n + step, radius) / sersic_normalisation(n - step, radius))
+    k, central = sersic_k(n), sersic_normalisation(n, radius)
+    rise = math.log(sersic_normalisation(n + step, radius) / sersic_normalisation(n - step, radius))
     rise_k = sersic_k(n + step) - sersic_k(n - step)
-    e2_total = e1 * e1 + e2 * e2
-    return np.array(
-        [
-            i0,
-            k,
-            0.5 / n,
-            1.0 / radius**2,
-            e1,
-            e2,
-            x,
-            y,
-            0.5 * rise_i0 / step,
-            0.5 * rise_k / step,
-            n,
-            1.0 + e2_total,
-            1.0 / (1.0 - e2_total),
-            radius * (float(gammaincinv(2.0 * n, _CORE_SHARE)) / k) ** n,
-        ]
+    e_squared = e1 * e1 + e2 * e2
+    return ShapeConstants(
+        central=central,
+        k=k,
+        half_inverse_n=0.5 / n,
+        inverse_r2=1.0 / radius**2,
+        e1=e1,
+        e2=e2,
+        x=x,
+        y=y,
+        ln_central_by_n=0.5 * rise / step,
+        k_by_n=0.5 * rise_k / step,
+        n=n,
+        stretch=1.0 + e_squared,
+        squeeze=1.0 / (1.0 - e_squared),
+        core=radius * (float(gammaincinv(2.0 * n, _CORE_SHARE)) / k) ** n,
     )
 
 
 @inlined_kernel
-def add_point(x: float, y: float, weight: float, c: FloatArray, out: FloatArray) -> None:
-    """Add ``weight`` times derivatives and brightness (COLUMNS,) at a point; ``c`` from :func:`shape_arguments`.
+def add_point(x: float, y: float, weight: float, c: ShapeConstants, out: FloatArray) -> None:
+    """Add ``weight`` times derivatives and brightness (COLUMNS,) at a point; ``c`` from :func:`shape_constants`.
 
     With rho^2 = dx^2 + dy^2 the elliptical radius is
     r_eff^2 z = [(1 + e^2) rho^2 - 2 e1 (dx^2 - dy^2) - 4 e2 dx dy] / (1 - e^2), and I = I_0 exp(-k z^(1/2n)).
     """
-    dx, dy = x - c[6], y - c[7]
+    dx, dy = x - c.x, y - c.y
     rho2, along, across = dx * dx + dy * dy, dx * dx - dy * dy, 2.0 * dx * dy
-    radius2 = c[12] * (c[11] * rho2 - 2.0 * (c[4] * along + c[5] * across))
-    z = max(radius2 * c[3], 1e-40)
+    radius2 = c.squeeze * (c.stretch * rho2 - 2.0 * (c.e1 * along + c.e2 * across))
+    z = max(radius2 * c.inverse_r2, 1e-40)
     ln_z = math.log(z)
-    exponent = c[1] * math.exp(c[2] * ln_z)
-    value = weight * c[0] * math.exp(-exponent)
-    by_z = -value * exponent * c[2] / z
-    by_radius2 = by_z * c[3]
-    out[0] += -2.0 * value - 2.0 * z * by_z
-    out[1] += by_radius2 * 2.0 * c[12] * (c[4] * rho2 - along + c[4] * radius2)
-    out[2] += by_radius2 * 2.0 * c[12] * (c[5] * rho2 - across + c[5] * radius2)
-    out[3] -= by_radius2 * 2.0 * c[12] * (c[11] * dx - 2.0 * (c[4] * dx + c[5] * dy))
-    out[4] -= by_radius2 * 2.0 * c[12] * (c[11] * dy - 2.0 * (c[5] * dx - c[4] * dy))
-    out[5] += value * (c[8] - exponent * (c[9] / c[1] - ln_z * c[2] / c[10]))
-    out[6] += value
+    exponent = c.k * math.exp(c.half_inverse_n * ln_z)
+    value = weight * c.central * math.exp(-exponent)
+    by_z = -value * exponent * c.half_inverse_n / z
+    by_radius2 = by_z * c.inverse_r2
+    out[LN_R_EFF] += -2.0 * value - 2.0 * z * by_z
+    out[E1] += by_radius2 * 2.0 * c.squeeze * (c.e1 * rho2 - along + c.e1 * radius2)
+    out[E2] += by_radius2 * 2.0 * c.squeeze * (c.e2 * rho2 - across + c.e2 * radius2)
+    out[X] -= by_radius2 * 2.0 * c.squeeze * (c.stretch * dx - 2.0 * (c.e1 * dx + c.e2 * dy))
+    out[Y] -= by_radius2 * 2.0 * c.squeeze * (c.stretch * dy - 2.0 * (c.e2 * dx - c.e1 * dy))
+    out[N] += value * (c.ln_central_by_n - exponent * (c.k_by_n / c.k - ln_z * c.half_inverse_n / c.n))
+    out[BRIGHTNESS] += value
 
 
 @kernel
@@ -118,7 +121,7 @@ def add_cell(
     bx: float,
     by: float,
     weight: float,
-    c: FloatArray,
+    c: ShapeConstants,
     out: FloatArray,
     stack: FloatArray,
 ) -> None:
@@ -134,10 +137,10 @@ def add_cell(
         px, py, depth = stack[held, 0], stack[held, 1], stack[held, 2]
         scale = 0.5**depth
         size = size0 * scale
-        dx, dy = px - c[6], py - c[7]
+        dx, dy = px - c.x, py - c.y
         near = dx * dx + dy * dy <= (_CLEARANCE * size) ** 2
-        if not near or depth >= _MAX_DEPTH or size < c[13]:
-            by_x, by_y = out[3], out[4]
+        if not near or depth >= _MAX_DEPTH or size < c.core:
+            by_x, by_y = out[X], out[Y]
             part = 0.25 * weight * scale * scale
             step = _GAUSS * scale
             for k in range(4):
@@ -146,7 +149,7 @@ def add_cell(
                 add_point(px + s * ax + t * bx, py + s * ay + t * by, part, c, out)
             if near:
                 # In the core the derivatives by the centre are odd and cancel; four points beside a pole do not.
-                out[3], out[4] = by_x, by_y
+                out[X], out[Y] = by_x, by_y
         else:
             half = 0.5 * scale
             for k in range(4):
@@ -165,7 +168,8 @@ def new_stack() -> FloatArray:
 
 
 @kernel
-def _grid_columns(x_edges: FloatArray, y_edges: FloatArray, c: FloatArray) -> FloatArray:
+def _grid_columns(x_edges: FloatArray, y_edges: FloatArray, c: ShapeConstants) -> FloatArray:
+    """Means (ny nx, COLUMNS) over the cells between edges (nx + 1,) and (ny + 1,) [arcsec]."""
     nx, ny = x_edges.size - 1, y_edges.size - 1
     out = np.empty((nx * ny, COLUMNS))
     total, stack = np.empty(COLUMNS), new_stack()
@@ -181,9 +185,9 @@ def _grid_columns(x_edges: FloatArray, y_edges: FloatArray, c: FloatArray) -> Fl
 
 def columns_on_grid(shape: FloatArray, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
     """Mean of derivatives and brightness over the cells between edges: (ny nx, COLUMNS), for unit flux [arcsec^-2]."""
-    return np.asarray(_grid_columns(x_edges, y_edges, shape_arguments(shape)))
+    return np.asarray(_grid_columns(x_edges, y_edges, shape_constants(shape)))
 
 
 def profile_on_grid(profile: SersicProfile, x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:
     """Mean surface brightness [e-/s arcsec^-2] of a profile over the cells between edges, (ny nx,)."""
-    return np.asarray(profile.flux * columns_on_grid(shape_of(profile), x_edges, y_edges)[:, -1])
+    return np.asarray(profile.flux * columns_on_grid(shape_of(profile), x_edges, y_edges)[:, BRIGHTNESS])

@@ -12,7 +12,7 @@ import numpy as np
 
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
-from engine.light.sersic import SersicProfile, sersic_k, sersic_normalisation
+from engine.light.sersic import SersicConstants, SersicProfile, sersic_k, sersic_normalisation
 
 _BIN_BITS = 5
 _SHIFT = np.uint64(52 - _BIN_BITS)
@@ -61,13 +61,13 @@ def brightness(u: FloatArray, v: FloatArray, table: FloatArray) -> FloatArray:
 
 
 @kernel
-def to_profile_axes(x: FloatArray, y: FloatArray, light: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions (u, v) with u^2 + v^2 = (R / r_eff)^2; ``light`` from :func:`engine.light.sersic.kernel_arguments`."""
-    along = np.sqrt(light[4] * light[3])
-    across = np.sqrt(light[3] / light[4])
+def to_profile_axes(x: FloatArray, y: FloatArray, light: SersicConstants) -> tuple[FloatArray, FloatArray]:
+    """Positions (u, v) with u^2 + v^2 = (R / r_eff)^2; ``light`` from :func:`engine.light.sersic.sersic_constants`."""
+    along = np.sqrt(light.q * light.inverse_r2)
+    across = np.sqrt(light.inverse_r2 / light.q)
     u, v = np.empty(x.size), np.empty(x.size)
     for i in range(x.size):
-        dx, dy = x[i] - light[7], y[i] - light[8]
-        u[i] = along * (light[5] * dx + light[6] * dy)
-        v[i] = across * (light[5] * dy - light[6] * dx)
+        dx, dy = x[i] - light.x, y[i] - light.y
+        u[i] = along * (light.cos * dx + light.sin * dy)
+        v[i] = across * (light.cos * dy - light.sin * dx)
     return u, v

@@ -79,7 +79,11 @@ def _integrate(
     error: FloatArray,
     smooth: NDArray[np.bool_],
 ) -> None:
-    """Flux of each cell, the part of it that is certain, an estimate of its error, and whether it is smooth."""
+    """Flux of each of n cells, the part of it that is certain, an estimate of its error, and whether it is smooth.
+
+    ``u`` and ``v`` (13 n,) are where the nodes of a cell map to, in axes of the profile; ``area`` [arcsec^2] is a
+    cell's, ``weights`` (9,) are those of the 3 x 3 rule, ``table`` (bins, 4) is the radial one; the rest is (n,).
+    """
     for i in range(flux.size):
         k = 13 * i
         three, two = 0.0, 0.0

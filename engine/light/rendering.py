@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import SpecError
-from engine.lensing.power_law import PowerLawLens, trace_rays
-from engine.lensing.power_law import kernel_arguments as lens_arguments
+from engine.lensing.power_law import PowerLawLens, lens_constants, trace_rays
 from engine.light.brightness_bounds import brightness_range, length
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
 from engine.light.refinement import Tracer, refine_pixels
-from engine.light.sersic import SersicProfile
-from engine.light.sersic import kernel_arguments as sersic_arguments
+from engine.light.sersic import SersicProfile, sersic_constants
 
 DEFAULT_TOLERANCE = 1e-4
 """Estimated error of a pixel as a fraction of the brightest, and of all pixels together as a fraction of the flux."""
@@ -39,14 +37,14 @@ _HALO = 2
 
 def _tracer(profile: SersicProfile, lens: PowerLawLens | None) -> Tracer:
     """From image positions to the axes of the profile; without a lens nothing is deflected."""
-    light = sersic_arguments(profile)
+    light = sersic_constants(profile)
     if lens is None:
         return lambda x, y: to_profile_axes(x, y, light)
-    series = lens_arguments(lens)
+    constants = lens_constants(lens)
 
     def trace(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         bx, by = np.empty(x.size), np.empty(x.size)
-        trace_rays(x, y, *series, bx, by)
+        trace_rays(x, y, constants, bx, by)
         return to_profile_axes(bx, by, light)
 
     return trace
@@ -59,7 +57,8 @@ def _average(
     """Mean brightness over each pixel from its central ray and its neighbours', and an estimate of its error.
 
     The mean of f over a cell of unit side is f + (dxx + dyy)/24 - 17 (dxxxx + dyyyy)/5760 + dxxyy/576 in central
-    differences, up to sixth order. ``u``, ``v``, ``f`` have a halo of two pixels.
+    differences, up to sixth order. ``u`` and ``v``, where rays map to in axes of the profile, and the brightness ``f``
+    there are (ny + 4, nx + 4), with a halo of two pixels; ``mean`` and ``error`` (ny, nx) are written.
     """
     for j in range(mean.shape[0]):
         for i in range(mean.shape[1]):
@@ -110,6 +109,7 @@ def _greatest_of_neighbours(error: FloatArray) -> FloatArray:
 
 @kernel
 def _sum_below(error: FloatArray, limit: float) -> float:
+    """Sum of the errors (ny, nx) that are at most ``limit``."""
     total = 0.0
     for j in range(error.shape[0]):
         for i in range(error.shape[1]):
@@ -209,17 +209,3 @@ def sample_sersic(
     u, v = _tracer(profile, lens)(np.tile(x, y.size), np.repeat(y, x.size))
     rays = brightness(u, v, tabulate(profile)).reshape(y.size, x.size)
     return np.asarray(rays * (profile.flux * side**2))
-
-
-def sample_lensed_sersic(
-    profile: SersicProfile, lens: PowerLawLens, x: FloatArray, y: FloatArray, pixel_scale: float, subrays: int
-) -> FloatArray:
-    """Flux per pixel [e-/s] as the mean over ``subrays`` x ``subrays`` rays: quick, without an error bound.
-
-    For fits that need many renderings; arguments and shapes as in :func:`render_sersic`.
-    """
-    offsets = ((np.arange(subrays) + 0.5) / subrays - 0.5) * pixel_scale
-    columns, rows = np.add.outer(x, offsets).ravel(), np.add.outer(y, offsets).ravel()
-    u, v = _tracer(profile, lens)(np.tile(columns, rows.size), np.repeat(rows, columns.size))
-    rays = brightness(u, v, tabulate(profile)).reshape(len(y), subrays, len(x), subrays)
-    return np.asarray(rays.mean(axis=(1, 3)) * (profile.flux * pixel_scale**2))

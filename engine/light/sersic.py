@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import gamma, gammainc, gammaincinv
 
-from engine.conventions import FloatArray
+from engine.conventions import FloatArray, axis_ratio_and_angle, ellipticity
 from engine.errors import SpecError
 
 
@@ -46,6 +48,23 @@ class SersicProfile:
             raise SpecError("q", self.q, "an axis ratio in (0, 1]")
 
 
+SHAPE = ("ln_r_eff", "n", "e1", "e2", "x", "y")
+"""What a profile has besides its flux, as parameters of a fit: r_eff, x and y in arcsec, ellipticity components."""
+
+
+def shape_of(profile: SersicProfile) -> FloatArray:
+    """The parameters (6,) :data:`SHAPE` of a profile."""
+    return np.array(
+        [math.log(profile.r_eff), profile.n, *ellipticity(profile.q, profile.phi), profile.x, profile.y]
+    )  # fmt: skip
+
+
+def profile_of(shape: Sequence[float] | FloatArray, flux: float = 1.0) -> SersicProfile:
+    """The profile of parameters :data:`SHAPE` and a flux [e-/s]."""
+    ln_r, n, e1, e2, x, y = map(float, shape)
+    return SersicProfile(flux, math.exp(ln_r), n, *axis_ratio_and_angle(e1, e2), x, y)
+
+
 def sersic_k(n: float) -> float:
     """k(n) for which r_eff encloses half of the flux: the median of the gamma distribution of shape 2n."""
     return float(gammaincinv(2.0 * n, 0.5))
@@ -60,26 +79,43 @@ def sersic_normalisation(n: float, r_eff: float) -> float:
     return float(k ** (2.0 * n) / (2.0 * math.pi * n * r_eff**2 * gamma(2.0 * n)))
 
 
-def kernel_arguments(profile: SersicProfile) -> FloatArray:
-    """Packed parameters for the compiled kernels: I_0, k, 1/(2n), 1/r_eff^2, q, cos, sin, x, y."""
-    return np.array(
-        [
-            profile.flux * sersic_normalisation(profile.n, profile.r_eff),
-            sersic_k(profile.n),
-            0.5 / profile.n,
-            1.0 / profile.r_eff**2,
-            profile.q,
-            math.cos(profile.phi),
-            math.sin(profile.phi),
-            profile.x,
-            profile.y,
-        ]
+class SersicConstants(NamedTuple):
+    """A profile as the compiled kernels take it: I = central exp(-k (R^2 inverse_r2)^half_inverse_n).
+
+    ``central`` [e-/s arcsec^-2], ``half_inverse_n`` is 1 / 2n, ``inverse_r2`` is r_eff^-2 [arcsec^-2], (``cos``,
+    ``sin``) those of phi, ``x`` and ``y`` the centre [arcsec].
+    """
+
+    central: float
+    k: float
+    half_inverse_n: float
+    inverse_r2: float
+    q: float
+    cos: float
+    sin: float
+    x: float
+    y: float
+
+
+def sersic_constants(profile: SersicProfile) -> SersicConstants:
+    """The constants of a profile."""
+    # A whole number would be another type to the kernels.
+    return SersicConstants(
+        central=float(profile.flux * sersic_normalisation(profile.n, profile.r_eff)),
+        k=sersic_k(profile.n),
+        half_inverse_n=0.5 / profile.n,
+        inverse_r2=1.0 / profile.r_eff**2,
+        q=float(profile.q),
+        cos=math.cos(profile.phi),
+        sin=math.sin(profile.phi),
+        x=float(profile.x),
+        y=float(profile.y),
     )
 
 
 def surface_brightness(profile: SersicProfile, x: FloatArray, y: FloatArray) -> FloatArray:
     """Surface brightness [e-/s arcsec^-2] at positions [arcsec]; arrays of any one shape."""
-    i0, k, half_inverse_n, inverse_r2, q, c, s, x0, y0 = kernel_arguments(profile)
+    i0, k, half_inverse_n, inverse_r2, q, c, s, x0, y0 = sersic_constants(profile)
     u = c * (x - x0) + s * (y - y0)
     v = c * (y - y0) - s * (x - x0)
     return np.asarray(i0 * np.exp(-k * ((q * u * u + v * v / q) * inverse_r2) ** half_inverse_n))

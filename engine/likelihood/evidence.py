@@ -10,7 +10,7 @@ from scipy.linalg import lapack
 
 from engine.conventions import FloatArray
 from engine.errors import InversionError
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
 from engine.likelihood.w_tilde import curvature_matrix, workspace
 from engine.source.grid import SourceGrid
@@ -114,7 +114,7 @@ def _map_and_curve(
     likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel, memory: FloatArray | None = None
 ) -> tuple[LensingMatrix, FloatArray]:
     """L and F, which lies in ``memory`` where that is given."""
-    lensing = map_rays(likelihood.rays, kernel_arguments(lens), model.shape)
+    lensing = map_rays(likelihood.rays, lens, model.shape)
     return lensing, curvature_matrix(likelihood.w_tilde, likelihood.border, lensing, memory)
 
 

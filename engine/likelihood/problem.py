@@ -13,11 +13,8 @@ from scipy.ndimage import distance_transform_edt
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
 from engine.imaging.observation import Observation
-from engine.imaging.optics.exposed_matrix import exposed_blurring_matrix
-from engine.imaging.optics.extended import lensed_sersic_image
-from engine.imaging.optics.stamp_matrix import blurring_matrix, central_stamp, pixel_kernel
 from engine.lensing.lens_equation import solve_lens_equation
-from engine.lensing.power_law import kernel_arguments, source_position
+from engine.lensing.power_law import source_position
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.parametric.fit import ParametricFit
 from engine.source.envelope import Envelope
@@ -58,11 +55,6 @@ def ring_mask(
     return np.asarray((radius >= inner) & (radius <= outer))
 
 
-def _pixels(chosen: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    rows, columns = np.nonzero(chosen)
-    return rows, columns
-
-
 def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tuple[str, ...], FloatArray]:
     names, images = [], []
     for k, agn in enumerate(fit.agn):
@@ -70,7 +62,7 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
         images.append(observation.point_source(agn.x, agn.y))
     if fit.deflector is not None:
         names.append("deflector")
-        images.append(lensed_sersic_image(observation, fit.deflector) / fit.deflector.flux)
+        images.append(observation.optics.sersic_image(fit.deflector) / fit.deflector.flux)
     names.append("background")
     images.append(np.ones(observation.shape))
     return tuple(names), np.stack(images)
@@ -86,14 +78,7 @@ def _noise(
     observation: Observation, fit: ParametricFit, analysis: Analysis, mask: NDArray[np.bool_], core: NDArray[np.bool_]
 ) -> FloatArray | sparse.csr_matrix:
     """Variances (M,) or covariance (M, M, sparse) of the data on the mask under the chosen treatment, cores boosted."""
-    variance = observation.noise[mask] ** 2
-    if observation.response is None:
-        # Where stars are moved stamps, the fit knows how wrong they are.
-        known = np.isfinite(fit.sigma[mask])
-        variance = np.where(known, np.maximum(variance, fit.sigma[mask] ** 2), variance)
-        # What the model misses counts as noise, as in the errors of the fit: in an image that no model describes a
-        # chain would stay in the first false maximum.
-        variance = variance * fit.misfit
+    variance = observation.optics.data_variance(observation.noise[mask] ** 2, fit.sigma[mask] ** 2, fit.misfit)
     boost = np.where(core[mask], variance * CORE_BOOST**2, 0.0)
     if analysis.noise_treatment == "covariance":
         if observation.covariance is None:
@@ -108,22 +93,9 @@ def _noise(
     return np.asarray(variance + boost)
 
 
-def _blurring(
-    observation: Observation, analysis: Analysis, mask: NDArray[np.bool_], lit: NDArray[np.bool_]
-) -> sparse.csr_matrix:
-    """B (M, P): by the exposures where they are known, by the PSF stamp where not."""
-    if observation.response is not None:
-        return exposed_blurring_matrix(
-            observation.response, _pixels(mask), _pixels(lit), analysis.subrays, analysis.psf_radius
-        )
-    # Divided by the average over the rays before it is cut, not after.
-    kernel = central_stamp(pixel_kernel(observation.psf, analysis.subrays), analysis.psf_radius)
-    return blurring_matrix(kernel, _pixels(mask), _pixels(lit))
-
-
 def _envelope(fit: ParametricFit, rays: RayBundle) -> Envelope:
     """The host of the parametric fit, placed by the AGN, on the scale of the source grid of its lens."""
-    grid = map_rays(rays, kernel_arguments(fit.lens), (2, 2)).grid
+    grid = map_rays(rays, fit.lens, (2, 2)).grid
     size = math.sqrt(float((grid.x[-1] - grid.x[0]) * (grid.y[-1] - grid.y[0])))
     x, y = 0.5 * (grid.x[0] + grid.x[-1]), 0.5 * (grid.y[0] + grid.y[-1])
     if rays.anchors.size:
@@ -143,7 +115,7 @@ def _defect(
     """
     if rays.envelope is None:
         raise ValueError("rays: got none with an envelope; without one there is no defect")
-    exact = lensed_sersic_image(observation, rays.envelope.host, rays.envelope.lens)[mask]
+    exact = observation.optics.sersic_image(rays.envelope.host, rays.envelope.lens)[mask]
     return np.asarray(exact - blurring @ rays.of_envelope())
 
 
@@ -177,7 +149,9 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
     x, y = pixel_centres(shape[1], scale), pixel_centres(shape[0], scale)
     anchors = np.array([(agn.x, agn.y) for agn in fit.agn])
     rays = cast_rays(mask, margin, x, y, scale, analysis.subrays, anchors)
-    blurring = _blurring(observation, analysis, mask, mask | margin)
+    blurring = observation.optics.blurring_matrix(
+        np.nonzero(mask), np.nonzero(mask | margin), analysis.subrays, analysis.psf_radius
+    )
     if analysis.source_envelope:
         rays = replace(rays, envelope=_envelope(fit, rays))
         defect = _defect(observation, mask, rays, blurring)

@@ -1,26 +1,19 @@
 """The regularisation strength: the lambda that maximises the evidence.
 
 With gamma = tr(A^-1 F) the number of parameters that the data determine and E = lambda s^T H s the penalty of the
-solution, d ln Z / d ln lambda = (gamma - E) / 2 (Gull 1989; MacKay 1992, section 4.4). Its zero is
-what is looked for.
-
-:func:`find_strength` factorises A at a few values of lambda and takes Newton steps on phi = ln gamma - ln E, which
-is far straighter in ln lambda than the derivative itself: gamma and E both fall and rise as powers of lambda. Its
-slope follows from the same factorisation,
-
-    d gamma / d ln lambda = -lambda tr(X - lambda X^2),      X = H A^-1,
-    d E / d ln lambda     = E - 2 lambda^2 s^T X H s.
+solution, d ln Z / d ln lambda = (gamma - E) / 2 (Gull 1989; MacKay 1992, section 4.4). Its zero is what is looked for,
+as that of ln gamma - ln E, which is far straighter in ln lambda: gamma and E both fall and rise as powers of lambda.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import lapack
+from scipy.optimize import brentq
 
-from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError, SpecError
 from engine.lensing.power_law import PowerLawLens
@@ -32,86 +25,41 @@ LOWEST, HIGHEST = -80.0, 80.0
 """Interval of ln lambda that is searched where none is given."""
 
 _TOLERANCE = 1e-3
-_LAST_STEP = 0.03
-"""A Newton step this short leaves an error of about its square, below the tolerance: it is taken without a check."""
-_LONGEST_STEP = 8.0
-_MAX_FACTORISATIONS = 60
-_DECIDED = 1e-6
-"""Where gamma is below this share of n, every mode falls as 1 / lambda, and n - lambda tr(X) is rounding."""
+_STEP = 8.0
+"""In ln lambda, while the maximum is not yet between two values."""
 
 
 @dataclass(frozen=True)
 class Strength:
-    """Where the evidence of a lens has its maximum in ln lambda.
-
-    ``curvature`` is the second derivative of ln Z there (negative); ``effective_parameters`` is gamma;
-    ``factorisations`` counts the Cholesky factorisations of A that were tried.
-    """
+    """Where the evidence of a lens has its maximum in ln lambda, and how often A was factorised to find it."""
 
     ln_lambda: float
-    curvature: float
-    effective_parameters: float
     factorisations: int
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Slope:
-    """phi = ln gamma - ln E at one ln lambda, its derivative, and gamma."""
+    """ln gamma - ln E by ln lambda for F (n, n), valid in its lower triangle, and D (n,); counts its factorisations."""
 
-    phi: float
-    derivative: float
-    gamma: float
+    f: FloatArray
+    d: FloatArray
+    model: SourceModel
+    factorisations: int = field(default=0, init=False)
 
-
-@kernel
-def _mirror(matrix: FloatArray) -> None:
-    """Copy the upper triangle of a Fortran-ordered matrix into its lower one, by blocks that fit the cache."""
-    n, block = matrix.shape[0], 32
-    for first in range(0, n, block):
-        for second in range(first, n, block):
-            for j in range(second, min(second + block, n)):
-                for i in range(first, min(first + block, j)):
-                    matrix[j, i] = matrix[i, j]
-
-
-@kernel
-def _trace_of_square(matrix: FloatArray) -> float:
-    """tr(X X), by blocks that fit the cache."""
-    n, block, total = matrix.shape[0], 32, 0.0
-    for first in range(0, n, block):
-        for second in range(0, n, block):
-            for i in range(first, min(first + block, n)):
-                for j in range(second, min(second + block, n)):
-                    total += matrix[i, j] * matrix[j, i]
-    return total
-
-
-def _slope(f: FloatArray, d: FloatArray, ln_lambda: float, model: SourceModel) -> _Slope | None:
-    """Phi at one ln lambda; None where A cannot be trusted in float64. ``f`` is lower triangular F."""
-    strength = math.exp(ln_lambda)
-    a = f.copy()
-    add_regularisation(a, model, strength)
-    factor, info = lapack.dpotrf(a.T, lower=0, clean=0, overwrite_a=1)
-    if info != 0 or least_condition(factor) > MAX_CONDITION:
-        return None
-    h = sparse_regularisation(model)
-    solution, _ = lapack.dpotrs(factor, d, lower=0)
-    inverse, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
-    _mirror(inverse)
-    rows, columns = h.nonzero()
-    trace = float(h.data @ inverse[rows, columns])
-    gamma = d.size - strength * trace
-    if gamma > _DECIDED * d.size:
-        x = np.asarray(h @ inverse.T)
-        falls = strength * trace - strength**2 * float(_trace_of_square(x))
-    else:
-        gamma = falls = float(2.0 * (np.tril(f, -1) * inverse).sum() + np.diag(f) @ np.diag(inverse))
-    hs = h @ solution
-    penalty = strength * float(solution @ hs)
-    if not (gamma > 0.0 and penalty > 0.0):
-        return None
-    rises = penalty - 2.0 * strength**2 * float(hs @ inverse @ hs)
-    return _Slope(math.log(gamma / penalty), -falls / gamma - rises / penalty, gamma)
+    def __call__(self, ln_lambda: float) -> float:
+        """Positive where the evidence rises; infinite where A cannot be trusted in float64 and needs more of lambda."""
+        self.factorisations += 1
+        a = self.f.copy(order="F")
+        add_regularisation(a, self.model, math.exp(ln_lambda))
+        factor, info = lapack.dpotrf(a, lower=1, clean=0, overwrite_a=1)
+        if info != 0 or least_condition(factor) > MAX_CONDITION:
+            return math.inf
+        solution, _ = lapack.dpotrs(factor, self.d, lower=1)
+        inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=1)
+        # Both are symmetric, and the lower triangle is what there is of them.
+        gamma = float(2.0 * (np.tril(self.f, -1) * np.tril(inverse, -1)).sum() + np.diag(self.f) @ np.diag(inverse))
+        penalty = math.exp(ln_lambda) * float(solution @ (sparse_regularisation(self.model) @ solution))
+        return math.log(gamma / penalty) if gamma > 0.0 and penalty > 0.0 else math.inf
 
 
 def find_strength(
@@ -123,7 +71,7 @@ def find_strength(
     high: float = HIGHEST,
     start: float | None = None,
 ) -> Strength:
-    """Find the maximum of the evidence in ln lambda to 1e-3, by Newton steps kept between ``low`` and ``high``.
+    """Find the maximum of the evidence in ln lambda to 1e-3, between ``low`` and ``high``.
 
     The search begins at ``start``, or where lambda H is a hundredth of F in the trace; it climbs, so that of several
     maxima it finds one near there.
@@ -134,28 +82,42 @@ def find_strength(
         The evidence still rises at an end of the interval (at the upper one the data hold no source that stands out
         of the noise), or A cannot be factorised anywhere in it.
     """
+    if not low < high:
+        raise SpecError("ln lambda", (low, high), "an interval with its lower end first")
     f, d = normal_equations(likelihood, lens, model)
     if start is None:
         trace, scale = float(np.trace(f)), float(sparse_regularisation(model).diagonal().sum())
         start = math.log(0.01 * trace / scale) if trace > 0.0 else 0.5 * (low + high)
-    at, search = min(max(start, low), high), _Bracket(low, high)
-    for tried in range(1, _MAX_FACTORISATIONS + 1):
-        slope = _slope(f, d, at, model)
-        search.learn(at, rising=slope is None or slope.phi > 0.0)
-        if slope is not None and slope.derivative < 0.0:
-            step = -slope.phi / slope.derivative
-            if abs(step) < _LAST_STEP and low < at + step < high:
-                # gamma = E at the zero, where the second derivative of ln Z is gamma phi' / 2.
-                return Strength(at + step, 0.5 * slope.gamma * slope.derivative, slope.gamma, tried)
-        else:
-            step = _LONGEST_STEP if search.below == at else -_LONGEST_STEP
-        if search.above - search.below < _TOLERANCE:
+    slope = _Slope(f, d, model)
+    below, above = _bracket(slope, min(max(start, low), high), low, high)
+    return Strength(float(brentq(slope, below, above, xtol=_TOLERANCE)), slope.factorisations)
+
+
+def _bracket(slope: _Slope, start: float, low: float, high: float) -> tuple[float, float]:
+    """Two values of ln lambda between which the evidence turns from rising to falling, A factorised at both."""
+    at, found = start, slope(start)
+    step = _STEP if found > 0.0 else -_STEP
+    while True:
+        before, at = (at, found), min(max(at + step, low), high)
+        if at == before[0]:
+            raise _no_maximum(low, high, rising=step > 0.0)
+        found = slope(at)
+        if (found > 0.0) != (before[1] > 0.0):
             break
-        at = search.inside(at + min(max(step, -_LONGEST_STEP), _LONGEST_STEP))
-    raise InversionError(
-        f"ln lambda: the evidence has no maximum between {low:.1f} and {high:.1f} where A can be factorised; "
-        "fewer source pixels are needed"
-    )
+    (below, rising), (above, _) = sorted([before, (at, found)])
+    while math.isinf(rising):
+        if above - below < _TOLERANCE:
+            raise InversionError(
+                f"ln lambda: the evidence has no maximum between {low:.1f} and {high:.1f} where A can be factorised; "
+                "fewer source pixels are needed"
+            )
+        middle = 0.5 * (below + above)
+        found = slope(middle)
+        if found > 0.0:
+            below, rising = middle, found
+        else:
+            above = middle
+    return below, above
 
 
 def _no_maximum(low: float, high: float, *, rising: bool) -> InversionError:
@@ -163,35 +125,3 @@ def _no_maximum(low: float, high: float, *, rising: bool) -> InversionError:
         f"ln lambda: the evidence rises towards the {'upper' if rising else 'lower'} end of {low:.1f} to {high:.1f}; "
         "a wider interval is needed, or the data hold no source that stands out of the noise"
     )
-
-
-class _Bracket:
-    """The part of the interval where the evidence still has to turn from rising to falling."""
-
-    def __init__(self, low: float, high: float) -> None:
-        if not low < high:
-            raise SpecError("ln lambda", (low, high), "an interval with its lower end first")
-        self._low, self._high = low, high
-        self._low_tried = self._high_tried = False
-        self.below, self.above = low, high
-
-    def learn(self, at: float, *, rising: bool) -> None:
-        """Take in on which side of ``at`` the maximum lies; an InversionError where that is outside."""
-        if (rising and at >= self._high) or (not rising and at <= self._low):
-            raise _no_maximum(self._low, self._high, rising=rising)
-        self._low_tried |= at <= self._low
-        self._high_tried |= at >= self._high
-        if rising:
-            self.below = at
-        else:
-            self.above = at
-
-    def inside(self, wanted: float) -> float:
-        """``wanted`` where it is inside; an end that has not been tried; the middle otherwise."""
-        if self.below < wanted < self.above:
-            return wanted
-        if wanted >= self.above and self.above == self._high and not self._high_tried:
-            return self._high
-        if wanted <= self.below and self.below == self._low and not self._low_tried:
-            return self._low
-        return 0.5 * (self.below + self.above)

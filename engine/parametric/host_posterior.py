@@ -1,20 +1,15 @@
-"""The host of a parametric fit as a distribution, of which the ``image`` estimator takes its draws."""
+"""The host of a parametric fit as a distribution: what the ``image`` estimator answers with."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import dataclass, replace
 
 from engine.conventions import FloatArray
-from engine.light.sersic import SersicProfile
-from engine.parametric.model import sersic_of
+from engine.light.sersic import SHAPE, SersicProfile, profile_of
 
-COORDINATES = ("ln_flux", "ln_r_eff", "n", "e1", "e2", "x", "y")
+COORDINATES = ("ln_flux", *SHAPE)
 _N = COORDINATES.index("n")
-_ROUNDS = 64
-"""How often draws outside the bounds are drawn again."""
 
 
 @dataclass(frozen=True)
@@ -34,46 +29,17 @@ class HostPosterior:
     n_at_bound: bool
     r_eff_at_bound: bool
 
-    def draws(self, number: int, rng: np.random.Generator) -> tuple[SersicProfile, ...]:
-        """Profiles drawn from it.
-
-        Where there are enough of them their mean and covariance are those of the Gaussian, so that an average over few
-        draws has no chance in it; what lies outside the bounds is drawn again.
-        """
-        root = _root(self.covariance)
-        points = self.mean + _matched(rng.standard_normal((number, self.mean.size))) @ root.T
-        for _ in range(_ROUNDS):
-            outside = ((points < self.low) | (points > self.high)).any(axis=1)
-            if not outside.any():
-                break
-            again = rng.standard_normal((int(outside.sum()), self.mean.size))
-            points[outside] = self.mean + again @ root.T
-        points = np.clip(points, self.low, self.high)
-        return tuple(sersic_of(point[1:], math.exp(point[0])) for point in points)
-
     @property
     def profile(self) -> SersicProfile:
         """The profile at its maximum."""
-        return sersic_of(self.mean[1:], math.exp(self.mean[0]))
+        return profile_of(self.mean[1:], math.exp(self.mean[0]))
 
     def inside(self, low: float, high: float) -> HostPosterior:
         """The same, cut off at bounds of n between which its maximum lies."""
         lower, upper = self.low.copy(), self.high.copy()
         lower[_N], upper[_N] = low, high
-        return HostPosterior(self.mean, self.covariance, lower, upper, self.n_at_bound, self.r_eff_at_bound)
+        return replace(self, low=lower, high=upper)
 
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """R (d, d) with R R^T the covariance, which may have rows of zeros."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _matched(normal: FloatArray) -> FloatArray:
-    """Standard normal draws (k, d) with mean zero and unit covariance exactly, where there are twice as many as d."""
-    k, d = normal.shape
-    if k < 2 * d:
-        return normal
-    away = normal - normal.mean(axis=0)
-    factor = np.linalg.cholesky(away.T @ away / (k - 1))
-    return np.asarray(np.linalg.solve(factor, away.T).T)
+    def inflated(self, factor: float) -> HostPosterior:
+        """The same with standard deviations that are ``factor`` times as large."""
+        return replace(self, covariance=factor**2 * self.covariance)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 
-from engine.conventions import FloatArray
+from engine.conventions import FloatArray, axis_ratio_and_angle
 from engine.errors import PosteriorError
 from engine.lensing.power_law import PowerLawLens, magnification, source_position
 
@@ -37,11 +37,8 @@ def lens_from_positions(
     radius = float(np.mean(np.hypot(x, y)))
 
     def lens_of(values: FloatArray) -> PowerLawLens:
-        # Ellipticity components are smooth through the circular lens, where angle and axis ratio are not.
-        e = min(math.hypot(values[1], values[2]), 0.8)
-        return PowerLawLens(
-            theta_E=float(values[0]), q=(1 - e) / (1 + e), phi=0.5 * math.atan2(values[2], values[1]), slope=slope
-        )
+        theta_E, e1, e2 = map(float, values[:3])
+        return PowerLawLens(theta_E, *axis_ratio_and_angle(e1, e2), slope)
 
     def misfit(values: FloatArray) -> FloatArray:
         lens = lens_of(values)

@@ -8,7 +8,6 @@ import numpy as np
 from scipy import ndimage
 
 from engine.conventions import FloatArray, pixel_centres
-from engine.errors import ObservationError
 from engine.imaging.convolution import convolve
 from engine.imaging.optics.spline import place_stamp
 from engine.imaging.optics.stamp_matrix import central_stamp
@@ -55,10 +54,10 @@ def find_point_sources(
     noise: FloatArray,
     psf: FloatArray,
     pixel_scale: float,
-    number: int,
+    most: int,
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Detection, ...]:
-    """The ``number`` most significant point sources, brightest first.
+    """The most significant point sources, brightest first: peaks of five sigma or more.
 
     Parameters
     ----------
@@ -68,31 +67,11 @@ def find_point_sources(
         The drizzled PSF.
     pixel_scale : float
         arcsec.
-    number : int
-        How many to find.
+    most : int
+        How many to find at most.
     centre : pair of float
         Of the deflector [arcsec].
-
-    Raises
-    ------
-    ObservationError
-        Fewer peaks stand out.
     """
-    found = candidate_point_sources(image, noise, psf, pixel_scale, number, centre)
-    if len(found) < number:
-        raise ObservationError(f"agn: found {len(found)} point sources of {number}, at five sigma or more")
-    return found
-
-
-def candidate_point_sources(
-    image: FloatArray,
-    noise: FloatArray,
-    psf: FloatArray,
-    pixel_scale: float,
-    most: int,
-    centre: tuple[float, float] = (0.0, 0.0),
-) -> tuple[Detection, ...]:
-    """At most ``most`` peaks of five sigma or more, brightest first; arguments as of :func:`find_point_sources`."""
     rest = remove_deflector(image, pixel_scale, centre)
     core = central_stamp(psf, _FILTER_RADIUS)
     # With locally constant noise the matched filter's peak is flux * sum(core^2) and its noise sigma * |core|.

@@ -10,10 +10,11 @@ from itertools import combinations
 import numpy as np
 from scipy import ndimage
 
-from engine.conventions import FloatArray, pixel_centres
+from engine.conventions import FloatArray, axis_ratio_and_angle, pixel_centres
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.parametric.lens_start import lens_from_positions
+from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import Detection
 
 _CENTRE_REACH = 0.5
@@ -42,6 +43,10 @@ class Start:
     lens: PowerLawLens
     source: tuple[float, float]
     host_radius: float = 0.3
+
+    def vector(self, space: ParameterSpace) -> FloatArray:
+        """The parameters of a fit that begins here."""
+        return space.vector([(found.x, found.y) for found in self.agn], self.lens, self.host_radius, self.source)
 
 
 def filled_image(observation: Observation) -> FloatArray:
@@ -173,7 +178,7 @@ def starts_from_arc(theta_E: float, centre: tuple[float, float], agn: tuple[Dete
     """Starts on a lattice of Einstein radius, flattening, direction and source position, for a light arc alone."""
     axis = np.linspace(-_ARC_REACH, _ARC_REACH, _ARC_OFFSETS)
     shapes = [(1.0, 0.0)]
-    q = (1 - _ARC_ELLIPTICITY) / (1 + _ARC_ELLIPTICITY)
+    q, _ = axis_ratio_and_angle(_ARC_ELLIPTICITY, 0.0)
     shapes += [(q, math.pi * k / _ARC_ANGLES) for k in range(_ARC_ANGLES)]
     out = []
     for factor in _ARC_RADII:

@@ -25,8 +25,8 @@ from engine.result import ChainStatus, ChainSummary
 _SURROGATE_SHARE = 0.9
 """The remaining differential evolution is for what no surrogate has learnt."""
 _BURN_IN_STEPS = 5
-_LESSONS, _LESSON_STEPS, _USUAL_TAU = 2, 60, 2.0
-"""How often, and after how many steps, a chain may be a lesson for the surrogate and begin anew; tau after a lesson."""
+_RESTARTS, _RESTART_STEPS, _USUAL_TAU = 2, 60, 2.0
+"""How often, and after how many steps, a chain may be restarted with a surrogate that has learnt from it; tau then."""
 _CHUNK = 15
 _WINDOW = 5
 AUTOCORRELATION_TIMES = 50.0
@@ -58,7 +58,8 @@ def autocorrelation_time(samples: FloatArray) -> float:
     """Integrated autocorrelation time [steps], the largest over the parameters of (steps, walkers, parameters).
 
     The autocovariance about the mean of the whole ensemble is averaged over the walkers before it is normalised, so
-    that a walker that is stuck counts as what it is. Infinite where nothing has moved.
+    that a walker that is stuck counts as what it is: emcee's own estimate is NaN for a walker that has not moved and
+    1.0 for one that is stuck (benchmarks/LEDGER.md). Infinite where nothing has moved.
     """
     steps = samples.shape[0]
     away = samples - samples.mean(axis=(0, 1))
@@ -86,7 +87,7 @@ def run_chain(
     """Sample the target until the chain is ``length`` autocorrelation times long, or ``max_steps`` are spent.
 
     Fewer walkers than twice the parameters cannot follow each other: they walk on the surrogate alone. A chain that
-    sticks teaches the surrogate and begins anew; what it had is burn-in.
+    mixes badly is restarted, twice at most, with a surrogate that has learnt from its states; they count as burn-in.
 
     Raises
     ------
@@ -99,14 +100,14 @@ def run_chain(
         known = Recorded(target, list(laplace.known[0]), laplace.known[1].tolist())
     before = target.evaluations
     sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random)
-    tau, steps, left = math.inf, 0, _LESSONS
+    tau, steps, left = math.inf, 0, _RESTARTS
     while steps < max_steps and steps < length * tau:
         state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
         steps = sampler.iteration
         tau = autocorrelation_time(sampler.get_chain())
         if progress is not None:
             progress(min(1.0, steps / min(float(max_steps), length * tau)))
-        if left and _LESSON_STEPS <= steps < max_steps and length * (tau - _USUAL_TAU) > 2.0 * steps:
+        if left and _RESTART_STEPS <= steps < max_steps and length * (tau - _USUAL_TAU) > 2.0 * steps:
             left -= 1
             for values, found in zip(state.coords, state.log_prob, strict=True):
                 known.remember(values, float(found))

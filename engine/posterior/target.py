@@ -13,12 +13,11 @@ from engine.errors import InversionError, SpecError
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
 from engine.likelihood.evidence import Inversion, invert, ln_evidence
+from engine.parametric.parameters import LENS, SHEAR, SHEAR_RANGE, SLOPE_RANGE
 from engine.posterior.agn_positions import AgnPositions
 from engine.source.regularisation import SourceModel
 from engine.spec.priors import LensParameterName, ParameterPrior
 
-LENS_NAMES = ("theta_E", "q", "phi", "slope", "x", "y")
-SHEAR_NAMES = ("gamma1", "gamma2")
 STRENGTH = "ln_lambda"
 
 
@@ -111,13 +110,11 @@ def wide_prior(lens: PowerLawLens, *, shear: bool) -> Prior:
     theta_E within 30 %, q in (0.2, 1), the angle within 90 degrees, slope in (1.3, 2.7), the centre within 0.3
     arcsec, shear components within 0.4, ln lambda in (-30, 10): far wider than any posterior of the study.
     """
-    low = [0.7 * lens.theta_E, 0.2, lens.phi - math.pi / 2, 1.3, lens.x - 0.3, lens.y - 0.3]
-    high = [1.3 * lens.theta_E, 1.0, lens.phi + math.pi / 2, 2.7, lens.x + 0.3, lens.y + 0.3]
-    names: tuple[str, ...] = LENS_NAMES
-    if shear:
-        names, low, high = names + SHEAR_NAMES, [*low, -0.4, -0.4], [*high, 0.4, 0.4]
-    least, most = LN_LAMBDA_RANGE
-    return Prior.flat((*names, STRENGTH), np.array([*low, least]), np.array([*high, most]))
+    sides = [(0.7 * lens.theta_E, 1.3 * lens.theta_E), (0.2, 1.0), (lens.phi - math.pi / 2, lens.phi + math.pi / 2)]
+    sides += [SLOPE_RANGE, (lens.x - 0.3, lens.x + 0.3), (lens.y - 0.3, lens.y + 0.3)]
+    sides += [SHEAR_RANGE, SHEAR_RANGE] if shear else []
+    low, high = np.array([*sides, LN_LAMBDA_RANGE]).T
+    return Prior.flat((*LENS, *(SHEAR if shear else ()), STRENGTH), low, high)
 
 
 @dataclass

@@ -20,7 +20,7 @@ class EvidenceTrace:
 
     ``offsets`` (n,) are steps of the parameter from ``centre`` in units of its ``sd``; ``ln_evidence`` (n,) is ln Z
     there less that at the centre, minus infinity outside the prior and where the inversion is refused. ``truth`` is the
-    true value as an offset, None where it is not known.
+    true value as an offset, None where none is shown.
     """
 
     name: str
@@ -28,7 +28,7 @@ class EvidenceTrace:
     sd: float
     offsets: FloatArray
     ln_evidence: FloatArray
-    truth: float | None
+    truth: float | None = None
 
 
 def trace_evidence(
@@ -38,7 +38,6 @@ def trace_evidence(
     covariance: FloatArray,
     *,
     offsets: FloatArray = DEFAULT_OFFSETS,
-    truth: FloatArray | None = None,
 ) -> tuple[EvidenceTrace, ...]:
     """Trace ln Z through ``mean`` along each of d parameters.
 
@@ -50,13 +49,11 @@ def trace_evidence(
     target : callable
         Ln Z of a vector (d,).
     names : sequence of str
-        Of the parameters; the angle ``phi`` has the period pi.
+        Of the parameters.
     mean, covariance : arrays (d,), (d, d)
         The Gaussian approximation of the posterior.
     offsets : array (n,)
         In standard deviations.
-    truth : array (<= d,), optional
-        True values of the first parameters.
     """
     centre = target(mean)
     traces = []
@@ -64,9 +61,5 @@ def trace_evidence(
         sd = math.sqrt(float(covariance[k, k]))
         along = covariance[:, k] / sd
         values = np.array([target(mean + t * along) for t in offsets])
-        true: float | None = None
-        if truth is not None and k < truth.size:
-            away = float(truth[k] - mean[k])
-            true = (math.remainder(away, math.pi) if name == "phi" else away) / sd
-        traces.append(EvidenceTrace(name, float(mean[k]), sd, np.asarray(offsets), values - centre, true))
+        traces.append(EvidenceTrace(name, float(mean[k]), sd, np.asarray(offsets), values - centre))
     return tuple(traces)

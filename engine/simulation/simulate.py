@@ -17,13 +17,13 @@ from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.cusps import place_cusps
-from engine.imaging.drizzled_psf import DrizzledPsf, drizzled_psf
+from engine.imaging.drizzled_psf import drizzled_psf
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation, Provenance
-from engine.imaging.optics.exposed import PointResponse
+from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
@@ -79,7 +79,7 @@ def optical_psf(camera: Camera, oversampling: int, optics: Optics = NOMINAL_OPTI
 
 
 @lru_cache(maxsize=8)
-def image_psf(camera: Camera, geometry: Geometry) -> DrizzledPsf:
+def image_psf(camera: Camera, geometry: Geometry) -> FloatArray:
     """PSF of the drizzled image of a camera and geometry, computed once per process."""
     field = geometry.drizzled_shape[0] * geometry.drizzled_scale
     radius = math.floor(min(_PSF_REACH, _PSF_FIELD_SHARE * field) / geometry.drizzled_scale)
@@ -137,14 +137,14 @@ def combine(scene: Scene, exposures: Exposures, provenance: Provenance | None = 
     return Observation(
         image=drizzle(exposures.noisy, geometry),
         noise=np.sqrt(covariance.diagonal()).reshape(geometry.drizzled_shape),
-        psf=image_psf(scene.camera, geometry).psf,
+        psf=image_psf(scene.camera, geometry),
         pixel_scale=geometry.drizzled_scale,
         zero_point=scene.camera.zero_point,
         covariance=covariance,
         valid=(spoilt == 0).reshape(geometry.drizzled_shape),
         provenance={**_exposure_record(scene, exposures), **(provenance or {})},
         centre=scene.system.coordinates,
-        response=PointResponse(
+        response=ExposedOptics(
             optical_psf(scene.camera, geometry.oversampling), geometry, detector_kernel(scene.camera)
         ),
     )

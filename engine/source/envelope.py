@@ -13,7 +13,13 @@ from engine.conventions import FloatArray
 from engine.lensing.power_law import PowerLawLens
 from engine.light.cell_means import profile_on_grid
 from engine.light.radial_table import look_up, tabulate
-from engine.light.sersic import SersicProfile, kernel_arguments, sersic_k, sersic_normalisation
+from engine.light.sersic import (
+    SersicConstants,
+    SersicProfile,
+    sersic_constants,
+    sersic_k,
+    sersic_normalisation,
+)
 from engine.source.grid import SourceGrid
 
 
@@ -31,7 +37,7 @@ class PlacedEnvelope:
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Its value (k,) at points of the source plane [arcsec], to 2e-7 of the centre."""
-        return np.asarray(_envelope_at(x, y, kernel_arguments(self.profile), self.table, self.floor))
+        return np.asarray(_envelope_at(x, y, sersic_constants(self.profile), self.table, self.floor))
 
 
 @dataclass(frozen=True)
@@ -78,10 +84,11 @@ def _one_at_r_eff(profile: SersicProfile) -> SersicProfile:
 
 
 @kernel
-def _envelope_at(bx: FloatArray, by: FloatArray, light: FloatArray, table: FloatArray, floor: float) -> FloatArray:
+def _envelope_at(bx: FloatArray, by: FloatArray, light: SersicConstants, table: FloatArray, floor: float) -> FloatArray:
+    """Value of the envelope (k,) at points (k,) [arcsec] of the source plane, from its radial ``table`` (bins, 4)."""
     out = np.empty(bx.size)
     for i in range(bx.size):
-        dx, dy = bx[i] - light[7], by[i] - light[8]
-        u, v = light[5] * dx + light[6] * dy, light[5] * dy - light[6] * dx
-        out[i] = floor + look_up((light[4] * u * u + v * v / light[4]) * light[3], table)
+        dx, dy = bx[i] - light.x, by[i] - light.y
+        u, v = light.cos * dx + light.sin * dy, light.cos * dy - light.sin * dx
+        out[i] = floor + look_up((light.q * u * u + v * v / light.q) * light.inverse_r2, table)
     return out

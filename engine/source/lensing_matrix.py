@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import InversionError
-from engine.lensing.power_law import kernel_arguments as kernel_arguments_of_lens
-from engine.lensing.power_law import trace_rays
+from engine.lensing.power_law import PowerLawLens, lens_constants, trace_rays
 from engine.source.envelope import Envelope, PlacedEnvelope
 from engine.source.grid import SourceGrid
 
@@ -55,7 +54,7 @@ class RayBundle:
         if self.envelope is None:
             raise ValueError("rays: got none, allowed are rays with an envelope")
         bare = replace(self, envelope=replace(self.envelope, floor=0.0), centre=None)
-        return map_rays(bare, kernel_arguments_of_lens(self.envelope.lens), (2, 2)).apply(np.ones(4))
+        return map_rays(bare, self.envelope.lens, (2, 2)).apply(np.ones(4))
 
     @property
     def columns(self) -> int:
@@ -127,6 +126,7 @@ def cast_rays(
 
 @kernel
 def _bounds(bx: FloatArray, by: FloatArray, in_mask: NDArray[np.bool_], per_pixel: int) -> tuple[float, ...]:
+    """Left, right, bottom and top [arcsec] of the mapped rays (pixels per_pixel,) of the pixels in the mask."""
     left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
     for pixel in range(in_mask.size):
         if in_mask[pixel]:
@@ -171,6 +171,11 @@ def _fill(
     weights: FloatArray,
     entries: NDArray[np.int32],
 ) -> None:
+    """Rows of L from mapped rays (pixels per_pixel,) [arcsec] and nodes ``x`` (nx,), ``y`` (ny,).
+
+    A ray stands for ``ray_weight`` arcsec^2, times ``envelope`` at each ray where that is not empty. ``columns`` and
+    ``weights`` (pixels, 4 per_pixel) and ``entries`` (pixels,) are written, as :class:`LensingMatrix` has them.
+    """
     nx = x.size
     i, j = 0, 0
     for pixel in range(entries.size):
@@ -211,6 +216,7 @@ def _fill(
 def _apply(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], source: FloatArray
 ) -> FloatArray:
+    """L times a source (ny nx,): fluxes (pixels,)."""
     out = np.zeros(entries.size)
     for p in range(entries.size):
         for e in range(entries[p]):
@@ -222,6 +228,7 @@ def _apply(
 def _transpose(
     columns: NDArray[np.int32], weights: FloatArray, entries: NDArray[np.int32], image: FloatArray, n: int
 ) -> FloatArray:
+    """L^T times an image (pixels,): shape (n,)."""
     out = np.zeros(n)
     for p in range(entries.size):
         for e in range(entries[p]):
@@ -229,18 +236,17 @@ def _transpose(
     return out
 
 
-def map_rays(rays: RayBundle, lens_arguments: tuple[FloatArray, FloatArray], shape: tuple[int, int]) -> LensingMatrix:
+def map_rays(rays: RayBundle, lens: PowerLawLens, shape: tuple[int, int]) -> LensingMatrix:
     """Trace the rays through the lens and lay the source grid of ``shape`` (ny, nx) round those of the mask.
 
-    ``lens_arguments`` are those of :func:`engine.lensing.power_law.kernel_arguments`. Where the rays have an envelope,
-    the source is that times a function bilinear between the nodes. An InversionError tells of a mask without pixels or
-    rays that all fall on one line of the source plane.
+    Where the rays have an envelope, the source is that times a function bilinear between the nodes. An InversionError
+    tells of a mask without pixels or rays that all fall on one line of the source plane.
     """
-    ny, nx = shape
+    (ny, nx), constants = shape, lens_constants(lens)
     if not rays.in_mask.any():
         raise InversionError("mask: it has no pixel, at least one is needed")
     bx, by = np.empty(rays.x.size), np.empty(rays.x.size)
-    trace_rays(rays.x, rays.y, *lens_arguments, bx, by)
+    trace_rays(rays.x, rays.y, constants, bx, by)
     per_pixel = rays.subrays**2
     left, right, bottom, top = _bounds(bx, by, rays.in_mask, per_pixel)
     if not (right > left and top > bottom):
@@ -255,7 +261,7 @@ def map_rays(rays: RayBundle, lens_arguments: tuple[FloatArray, FloatArray], sha
         if rays.anchors.size:
             ax, ay = np.empty(len(rays.anchors)), np.empty(len(rays.anchors))
             anchor_x, anchor_y = np.ascontiguousarray(rays.anchors.T)
-            trace_rays(anchor_x, anchor_y, *lens_arguments, ax, ay)
+            trace_rays(anchor_x, anchor_y, constants, ax, ay)
             centre_x, centre_y = float(ax.mean()), float(ay.mean())
         placed = rays.envelope.placed(centre_x, centre_y, math.sqrt((right - left) * (top - bottom)))
         at_rays = placed.at(bx, by)
@@ -277,7 +283,7 @@ def map_rays(rays: RayBundle, lens_arguments: tuple[FloatArray, FloatArray], sha
     if rays.centre is not None:
         # The defect goes with t at the centre of the host: one ray, whose light is t itself.
         cx, cy = np.empty(1), np.empty(1)
-        trace_rays(np.array([rays.centre[0]]), np.array([rays.centre[1]]), *lens_arguments, cx, cy)
+        trace_rays(np.array([rays.centre[0]]), np.array([rays.centre[1]]), constants, cx, cy)
         last = slice(rays.pixels, None)
         _fill(cx, cy, 1, grid.x, grid.y, 1.0, np.ones(1), columns[last], weights[last], entries[last])
     return LensingMatrix(grid, columns, weights, entries, placed)

@@ -71,14 +71,6 @@ def sparse_regularisation(model: SourceModel) -> sparse.csr_matrix:
 
 
 @cache
-def regularisation_matrix(model: SourceModel) -> FloatArray:
-    """H as a dense read-only array of shape (ny nx, ny nx), for source pixels in row-major order."""
-    h = np.asarray(sparse_regularisation(model).toarray())
-    h.setflags(write=False)
-    return h
-
-
-@cache
 def _lower_entries(model: SourceModel) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]:
     """Row, column and value of the nonzero entries of H in its lower triangle."""
     lower = sparse.tril(sparse_regularisation(model), format="coo")

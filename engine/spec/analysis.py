@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import ArgsKwargs
 
+from engine.errors import SpecError
 from engine.spec.priors import Priors
 from engine.spec.quantities import STRICT, UNSIGNED, Count, Flag, Number
 
 ProfileName = Literal["draft", "standard", "reference", "paper"]
 NoiseTreatment = Literal["diagonal", "covariance", "paper_code"]
 RegularisationName = Literal["zeroth", "gradient", "curvature"]
+EstimatorName = Literal["paper", "covariance", "projected", "image"]
+ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
 PROFILES: dict[str, dict[str, Any]] = {
     "draft": {"walkers": 4, "chain_length": 30.0, "max_steps": 300},
     "standard": {},
@@ -35,6 +38,13 @@ PROFILES: dict[str, dict[str, Any]] = {
 """
 
 
+def _each_once(names: tuple[EstimatorName, ...]) -> tuple[EstimatorName, ...]:
+    """The names in the one order that they have in every digest."""
+    if len(set(names)) != len(names):
+        raise SpecError("", names, "estimators without repetition")
+    return tuple(sorted(names, key=ESTIMATORS.index))
+
+
 @dataclass(frozen=True, config=STRICT)
 class Analysis:
     """How a run is analysed. Nothing here knows the truth.
@@ -50,6 +60,7 @@ class Analysis:
     ``priors`` of the lens parameters, by name, come before those of the system. With ``agn_position_sd`` [arcsec per
     axis] the measured positions of the AGN images have to come from one point of the source plane. ``background_sd``
     [e-/s in a pixel] is how well the sky was taken off before; where None the background is free.
+    ``estimators`` are those whose answer is wanted: ``image`` alone needs neither an inversion nor a chain.
     """
 
     profile: ProfileName = "standard"
@@ -70,6 +81,14 @@ class Analysis:
     priors: Priors = Field(default_factory=dict)
     agn_position_sd: Annotated[Number, Field(ge=1e-5, le=1.0)] | None = None
     background_sd: Annotated[Number, Field(ge=1e-9, le=1e9)] | None = None
+    estimators: Annotated[
+        tuple[EstimatorName, ...], Field(min_length=1, max_length=len(ESTIMATORS)), AfterValidator(_each_once)
+    ] = ESTIMATORS
+
+    @property
+    def needs_chain(self) -> bool:
+        """Whether an estimator is asked for that looks at sources of the chain."""
+        return self.estimators != ("image",)
 
     @model_validator(mode="before")
     @classmethod

@@ -104,7 +104,7 @@ class Camera:
     pixel_scale: Scale
     drizzled_scale: Scale
     pixfrac: Scale
-    drizzle_kernel: Literal["square", "turbo", "gaussian", "point"]
+    drizzle_kernel: Literal["square"]
     oversampling: Annotated[Count, Field(ge=1, le=12)]
     zero_point: Magnitude
     gain: Positive

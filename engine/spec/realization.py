@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
-from engine.spec.analysis import Analysis
+from engine.spec.analysis import ESTIMATORS, Analysis
 from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.quantities import STRICT, Identifier, Seed, Slope
 from engine.spec.sky import Host, LensSystem, SystemChoice
@@ -50,6 +50,8 @@ class Realization:
         for name in ("agn_position_sd", "background_sd"):
             if dumped["analysis"][name] is None:
                 del dumped["analysis"][name]
+        if self.analysis.estimators == ESTIMATORS:
+            del dumped["analysis"]["estimators"]
         for holder in (dumped["analysis"], dumped["system"]):
             if isinstance(holder, dict) and not holder["priors"]:
                 del holder["priors"]

@@ -104,7 +104,7 @@ async def known_parameters(request: Request) -> None:
 
 
 def _require_one(source: Literal["query", "header"], name: str, values: list[str], schema: dict[str, Any]) -> None:
-    if len(values) > 1:
+    if len(values) > 1 and schema.get("type") != "array":
         raise InvalidRequestError(source, name, "given more than once")
     kinds = {kind.get("type") for kind in (schema, *schema.get("anyOf", ()))}
     for kind, (pattern, allowed) in _PLAIN.items():

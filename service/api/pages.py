@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from urllib.parse import urlencode
+
 from fastapi import Request, Response
 
 
@@ -9,7 +11,7 @@ def next_link(request: Request, response: Response, cursor: str | None) -> str |
     """Address of the page that begins after ``cursor``; also set as the header Link, relation next (RFC 8288)."""
     if cursor is None:
         return None
-    query = request.query_params.multi_items()
-    address = request.url.replace(scheme="", netloc="").include_query_params(**{**dict(query), "cursor": cursor})
+    query = [(name, value) for name, value in request.query_params.multi_items() if name != "cursor"]
+    address = f"{request.url.path}?{urlencode([*query, ('cursor', cursor)])}"
     response.headers["Link"] = f'<{address}>; rel="next"'
-    return str(address)
+    return address

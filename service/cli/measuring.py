@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from engine import ImageMeasurement, Observation
 
 _DPI = 110
+_SAID = {"parametric": "parametric fit"}
+"""What is said of a stage of the engine; all the others are the inversion."""
 
 
 def measure(
@@ -70,7 +72,7 @@ def measure(
             found = measure_image(
                 observation, profile=profile, agn_images=0 if no_agn else agn_images, deflector=not no_deflector,
                 shear=shear, theta_E=theta_e, positions=where, seed=seed, inversion=inversion,
-                progress=status.update,
+                progress=lambda stage, _: status.update(_SAID.get(stage, "inversion")),
             )  # fmt: skip
         _write(found, json_file, figure, fits)
     for line in _summary(found):
@@ -154,7 +156,7 @@ def _whole(path: Path, write: Callable[[Path], Any]) -> None:
 
 def _summary(found: ImageMeasurement) -> list[str]:
     host, lens = found.host, found.lens
-    values = (("magnitude", host.magnitude), ("radius", host.radius), ("n", host.n))
+    values = (("magnitude", host.magnitude), ("radius", host.r_eff), ("n", host.n))
     lines = [f"host.{name:10s} {value.mean:8.3f} +- {value.sd:.3f}" for name, value in values]
     lines += [f"lens.{name:10s} {value.mean:8.3f} +- {value.sd:.3f}" for name, value in lens.items()]
     lines.append(f"{len(found.agn)} AGN images, chi2/dof {found.chi2_per_dof:.2f}, {found.estimator}, {found.status}")

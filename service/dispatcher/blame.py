@@ -53,7 +53,7 @@ class Blame:
             gone = self._flights.take_missing(present)
             self.lose(gone, "the worker is gone")
             for flight in gone:
-                flight.future.cancel()
+                flight.drop()
         self.judge(pool)
 
     def replace_stalled(self, pool: Pool) -> None:

@@ -9,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from distributed.client import ClosedClientError
+
 from service.dispatcher.placement import Slots
 from service.dispatcher.pool import Pool, Worker
 from service.dispatcher.stalls import WorkerMemory
@@ -50,6 +52,12 @@ class Flight:
         except TimeoutError:
             self.patience_s = min(2.0 * self.patience_s, GATHER_S)
             raise
+
+    def drop(self) -> None:
+        """Let Dask forget it."""
+        # Dask's client closes itself when the scheduler is gone, and this may be the moment.
+        with suppress(ClosedClientError):
+            self.future.cancel()
 
 
 class Flights:

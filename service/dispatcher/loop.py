@@ -236,7 +236,7 @@ class Dispatcher:
         for flight in self._flights:
             if stranded or is_lost(flight.future):
                 self._blame.lose([self._flights.take(flight)], "no workers" if stranded else "unknown to Dask")
-                flight.future.cancel()
+                flight.drop()
             elif now - flight.started > self._settings.deadline_s:
                 late.append(self._flights.take(flight))
                 self._endings.fail(flight.lease, overdue(self._settings.deadline_s))

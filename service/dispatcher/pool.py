@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 from uuid import uuid4
 
+from distributed.client import ClosedClientError
+
 from service.dispatcher.clusters import open_client
 from service.dispatcher.pickle_guard import read_error
 from service.dispatcher.stalls import LOOK_S, Asked, Condition, Stall, Stalls, WorkerMemory, read_conditions
@@ -59,8 +61,7 @@ class Pool:
         self._greetings: dict[str, Asked] = {}
         self._refused: set[str] = set()
         self._conditions: dict[str, Condition] = {}
-        self._patience_s = settings.worker_patience_s
-        self._stalls = Stalls(settings.worker_ttl_s, self._patience_s)
+        self._stalls = Stalls(settings.worker_ttl_s, settings.worker_patience_s)
         self._conditions_due = float("-inf")
         self._unfit: list[tuple[float, Stall]] = []
         self._failures = 0
@@ -179,16 +180,20 @@ class Pool:
             raise OSError(f"the scheduler cannot be asked: {error}") from error
 
     def _on(self, address: str, key: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        return self._client.submit(
-            function,
-            self._settings.task,
-            *arguments,
-            key=key,
-            workers=[address],
-            allow_other_workers=False,
-            pure=False,
-            retries=0,
-        )
+        """The future of a call on a worker; OSError where the scheduler has gone."""
+        try:
+            return self._client.submit(
+                function,
+                self._settings.task,
+                *arguments,
+                key=key,
+                workers=[address],
+                allow_other_workers=False,
+                pure=False,
+                retries=0,
+            )
+        except ClosedClientError as error:
+            raise OSError(f"the scheduler cannot be given anything: {error}") from error
 
     def _look(self) -> None:
         now = time.monotonic()
@@ -218,8 +223,7 @@ class Pool:
     def _greet(self, address: str, threads: int, now: float, passed: float) -> None:
         """Ask a new worker what it carries; until it has answered it gets no run, and if it does not it is replaced."""
         if address not in self._greetings:
-            greeting = self._on(address, f"greet-{uuid4().hex}", greet)
-            self._greetings[address] = Asked(greeting, now, self._patience_s)
+            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet), now)
         asked = self._greetings[address]
         if not asked.future.done():
             if asked.has_stalled(self._conditions.get(address), passed, now):
@@ -248,7 +252,7 @@ class Pool:
 
     def _stop(self, addresses: list[str], futures: list[Any]) -> None:
         # KeyError: a worker that is gone.
-        with suppress(TimeoutError, OSError, KeyError, NotPlainError):
+        with suppress(TimeoutError, OSError, KeyError, NotPlainError, ClosedClientError):
             if futures:
                 self._client.cancel(futures, force=True)
             if not addresses:

@@ -13,9 +13,9 @@ from typing import Any
 from service.worker.answers import RUNNING
 
 LOOK_S = 2.0
-_GREETING, _BUSY_GREETING = 2.0, 30.0
-"""How much longer than to take work a greeting may take where the worker's processor idles, and where it works: cold
-kernels take minutes on a machine that is busy with other things."""
+GREETING_S, BUSY_GREETING_S = 40.0, 600.0
+"""How long a greeting may take where the worker's processor idles, and where it works: cold kernels take minutes on a
+machine that is busy with other things."""
 _BUSY_PERCENT = 20.0
 _PAUSE_FRACTION = 0.8
 
@@ -155,12 +155,10 @@ class Asked:
 
     future: Any
     since: float
-    patience_s: float
     idle_s: float = 0.0
 
     def has_stalled(self, condition: Condition | None, passed: float, now: float) -> bool:
         """Whether it is no longer waited for."""
         if condition is None or condition.cpu < _BUSY_PERCENT:
             self.idle_s += passed
-        given_s = now - self.since
-        return self.idle_s >= _GREETING * self.patience_s or given_s >= _BUSY_GREETING * self.patience_s
+        return self.idle_s >= GREETING_S or now - self.since >= BUSY_GREETING_S

@@ -204,7 +204,8 @@ class Installation:
         for process in left:
             with suppress(psutil.Error):
                 process.kill()
-        psutil.wait_procs(left, timeout=PATIENCE_S)
+        # Not until they are reaped: the first process of a container may never do that.
+        eventually(lambda: not self.processes(), what="the end of all processes")
         for started in self.started:
             started.wait(timeout=PATIENCE_S)
         self.client.__exit__()

@@ -125,7 +125,7 @@ class Settings(LogSettings):
     worker_ttl_s: Annotated[float, Field(ge=10.0, le=86400.0)] = 60.0
     """A worker that says nothing for so long is started anew."""
     worker_patience_s: Annotated[float, Field(ge=4.0, le=86400.0)] = 20.0
-    """A worker that is alive and takes no work for so long is replaced; twice as long for one that is not greeted."""
+    """A worker that is alive and takes no work for so long is replaced."""
 
     metrics_host: Host = "127.0.0.1"
     metrics_port: Annotated[int, Field(ge=1, le=65535)] | None = None

@@ -5,7 +5,6 @@ A worker sees no database. It answers with bytes of JSON only, errors included: 
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import logging
 import os
@@ -194,11 +193,9 @@ def _products(result: RunResult, artefacts: ArtefactStore) -> ArtefactPayload | 
         return None
     import numpy
 
-    values = {field.name: getattr(result.products, field.name) for field in dataclasses.fields(result.products)}
-    arrays = {name: numpy.asarray(value) for name, value in values.items() if value is not None}
     data = io.BytesIO()
     # Objects would be pickled, and nobody should have to unpickle a file to read it.
-    plain: dict[str, Any] = {name: array for name, array in arrays.items() if array.dtype != object}
+    plain: dict[str, Any] = {n: array for n, array in result.products.arrays().items() if array.dtype != object}
     numpy.savez_compressed(data, **plain)
     return artefacts.put(data.getvalue(), "npz")
 

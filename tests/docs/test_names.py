@@ -50,6 +50,13 @@ def test_every_module_that_is_run_exists(page: Path) -> None:
 
 
 @by_page
+def test_every_target_of_make_exists(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    text = "\n".join((*inline_code(page), *(block.text for block in blocks(page) if block.language == "sh")))
+    assert set(re.findall(r"^(?:\$ )?make ([a-z-]+)", text, re.MULTILINE)) <= targets
+
+
+@by_page
 def test_every_setting_exists(page: Path) -> None:
     known = {f"HOSTLENS_{name.upper()}" for name in Settings.model_fields} | OTHERS | DEPLOYMENT
     named = set(re.findall(r"\bHOSTLENS_[A-Z_]*[A-Z]\b(?!\*)", page.read_text()))

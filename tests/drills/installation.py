@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.runtime import installation as runtime
+from service.runtime.installation import PATIENCE_S, eventually, free_port, is_worker
 from service.runtime.installation import DidNotHappenError as DrillError
-from service.runtime.installation import eventually, free_port, is_worker
 
-__all__ = ["ROOT", "DrillError", "Installation", "eventually", "free_port", "installation", "is_worker"]
+__all__ = ["PATIENCE_S", "ROOT", "DrillError", "Installation", "eventually", "free_port", "installation", "is_worker"]
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -124,7 +124,8 @@ class TwoDispatchers(Drill):
                 stored_once(found, self.runs),
                 identical(found, calm),
                 Claim("each run executed once while both were there", max(before.values()) == 1),
-                Claim("at most the work in flight is done again", repeats <= 2),
+                # Of each worker what it is at, and what it has answered and nobody has stored yet.
+                Claim("at most the work in flight is done again", repeats <= 4),
             ),
         )
 

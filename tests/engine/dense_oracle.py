@@ -5,10 +5,10 @@ import math
 import numpy as np
 
 from engine.imaging.optics.stamp_matrix import blurring_matrix
-from engine.lensing.power_law import PowerLawLens, kernel_arguments
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.source.lensing_matrix import cast_rays, map_rays
-from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.source.regularisation import SourceModel, sparse_regularisation
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
 SCALE = 0.1
@@ -57,7 +57,7 @@ class Case:
             self.covariance = sigma**2
         self.columns = rng.normal(size=(m, amplitudes)) + 0.3
         model = SourceModel((12, 12))
-        mapping = map_rays(self.rays, kernel_arguments(LENS), model.shape)
+        mapping = map_rays(self.rays, LENS, model.shape)
         sx, sy = np.meshgrid(mapping.grid.x, mapping.grid.y)
         source = 4000.0 * np.exp(-0.5 * ((sx - 0.05) ** 2 + (sy + 0.03) ** 2) / 0.15**2)
         self.blurring = blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed))
@@ -75,12 +75,12 @@ class Case:
 
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""
-        mapping = map_rays(self.rays, kernel_arguments(lens), model.shape)
+        mapping = map_rays(self.rays, lens, model.shape)
         g = np.hstack([self.blurring @ mapping.dense(), self.columns])
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance
         inverse = np.linalg.inv(c)
-        h = regularisation_matrix(model)
+        h = sparse_regularisation(model).toarray()
         a = g.T @ inverse @ g
         a[:n, :n] += math.exp(ln_lambda) * h
         a[n:, n:] += np.diag(self.precisions)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from engine.imaging.drizzling import drizzle
-from engine.imaging.optics.extended import lensed_sersic_image
-from engine.lensing.power_law import kernel_arguments, source_position
+from engine.lensing.power_law import source_position
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.evidence import invert, ln_evidence
 from engine.likelihood.problem import prepare_problem
@@ -43,7 +42,7 @@ def test_evidence_and_source_are_those_of_explicit_matrices() -> None:
     exact, solution, covariance = case.oracle(LENS, 1.0, model)
     inversion = invert(case.likelihood(), LENS, 1.0, model)
     assert ln_evidence(case.likelihood(), LENS, 1.0, model) == pytest.approx(exact, rel=1e-8)
-    placed = map_rays(case.rays, kernel_arguments(LENS), model.shape).envelope
+    placed = map_rays(case.rays, LENS, model.shape).envelope
     assert placed is not None
     brightness = placed.on_cells(inversion.grid)
     assert np.allclose(inversion.source.ravel(), solution[:99] * brightness, rtol=1e-8, atol=1e-8 * abs(solution).max())
@@ -62,12 +61,12 @@ def test_the_curvature_is_that_of_the_brightness() -> None:
 
 def test_a_constant_ratio_is_the_envelope_itself_also_beyond_the_grid() -> None:
     case = Modulated()
-    mapping = map_rays(case.rays, kernel_arguments(LENS), (5, 5))
+    mapping = map_rays(case.rays, LENS, (5, 5))
     placed = mapping.envelope
     assert placed is not None
     fluxes = mapping.apply(np.ones(25))
     bare = replace(case.rays, envelope=None)
-    grid = map_rays(bare, kernel_arguments(LENS), (5, 5)).grid
+    grid = map_rays(bare, LENS, (5, 5)).grid
     assert np.array_equal(grid.x, mapping.grid.x)
     x, y = source_position(LENS, case.rays.x, case.rays.y)
     shape = surface_brightness(placed.profile, x, y) + placed.floor
@@ -120,7 +119,7 @@ def test_the_defect_makes_the_image_of_the_fitted_host_exact(seen: tuple[Simulat
     rays = problem.likelihood.rays
     assert rays.envelope is not None
     fluxes = np.append(rays.of_envelope(), 1.0)
-    exact = lensed_sersic_image(simulation.observation, rays.envelope.host, fit.lens)[problem.mask]
+    exact = simulation.observation.optics.sersic_image(rays.envelope.host, fit.lens)[problem.mask]
     assert np.abs(problem.likelihood.blurring @ fluxes - exact).max() < 1e-9 * exact.max()
 
 

@@ -1,4 +1,4 @@
-"""The host as the fit of the whole image knows it: draws, priors of n, priors of the lens, bias and coverage."""
+"""The host as the fit of the whole image knows it: its estimate, priors of n, priors of the lens, bias and coverage."""
 
 import math
 from dataclasses import replace
@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from benchmarks.biases import paper_runs
 from benchmarks.coverage import drawn_realization
 from engine.conventions import FloatArray, rate_to_magnitude
-from engine.estimators.image import refit_image
+from engine.estimators.image import image_estimate
 from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.parametric.host_posterior import COORDINATES, HostPosterior
-from engine.parametric.model import components
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.priors import ParameterPrior
@@ -34,46 +33,85 @@ def posterior(sd: float = 0.05, n: float = 2.0, low: float = 0.3, high: float = 
     return HostPosterior(mean, mixing @ mixing.T, lower, upper, n_at_bound=False, r_eff_at_bound=False)
 
 
-def coordinates(host: HostPosterior, number: int, seed: int = 0) -> FloatArray:
-    profiles = host.draws(number, np.random.default_rng(seed))
-    rows = [
-        (math.log(p.flux), math.log(p.r_eff), p.n, *components(p.q, p.phi), p.x, p.y)
-        for p in profiles
-    ]  # fmt: skip
-    return np.array(rows)
+def drawn(host: HostPosterior, number: int, middle: float) -> dict[str, FloatArray]:
+    """What the posterior says by brute force: draws of it, those outside the bounds thrown away."""
+    points = np.random.default_rng(5).multivariate_normal(host.mean, host.covariance, number)
+    inside = ((points >= host.low) & (points <= host.high)).all(axis=1)
+    ln_flux, ln_r, n, e1, e2, x, y = points[inside].T
+    e = np.hypot(e1, e2)
+    q = (1.0 - e) / (1.0 + e)
+    angle = np.degrees(0.5 * np.arctan2(e2, e1)) - 90.0
+    return {
+        "magnitude": 25.0 - 2.5 / math.log(10.0) * ln_flux,
+        "r_eff": np.exp(ln_r),
+        "r_eff_galfit": np.exp(ln_r) / np.sqrt(q),
+        "n": n,
+        "q": q,
+        "position_angle": np.remainder(angle - middle + 90.0, 180.0) - 90.0 + middle,
+        "x": x,
+        "y": y,
+    }
 
 
-def test_draws_have_the_mean_and_the_covariance_of_the_posterior() -> None:
-    host = posterior()
-    found = coordinates(host, 30)
-    # Exactly, but for rounding: chance has no part in an average over 30 draws.
-    assert np.allclose(found.mean(axis=0), host.mean, atol=1e-10)
-    assert np.allclose(np.cov(found.T), host.covariance, atol=1e-12)
-    few = coordinates(host, 4)
-    assert np.abs((few - host.mean) / np.sqrt(np.diag(host.covariance))).max() < 5.0
+@pytest.mark.parametrize(
+    "host",
+    [
+        pytest.param(posterior(0.02), id="inside the bounds"),
+        pytest.param(posterior(0.02, n=1.05, low=1.0, high=4.0), id="cut off at the lower bound of n"),
+        pytest.param(posterior(0.02, n=3.99, low=1.0, high=4.0), id="cut off at the upper bound of n"),
+    ],
+)
+def test_the_estimate_has_the_moments_of_the_posterior(host: HostPosterior) -> None:
+    estimate, number = image_estimate(host, "wide", 25.0), 1_000_000
+    middle = estimate.position_angle.mean
+    for name, values in drawn(host, number, middle).items():
+        found = getattr(estimate, name)
+        # Five standard errors of the half of the draws or more that are inside.
+        error = 5.0 * values.std() / math.sqrt(values.size)
+        assert found.mean == pytest.approx(values.mean(), abs=error), name
+        assert found.sd == pytest.approx(values.std(), abs=2.0 * error), name
 
 
-@given(st.floats(0.3, 8.0), st.floats(0.01, 1.0), st.integers(1, 40), st.integers(0, 5))
-def test_draws_are_hosts_within_the_bounds_whatever_the_width(n: float, sd: float, number: int, seed: int) -> None:
-    found = coordinates(posterior(sd, n).inside(1.0, 4.0), number, seed)
-    assert found.shape == (number, 7)
-    assert np.isfinite(found).all()
-    assert (found[:, N] >= 1.0).all()
-    assert (found[:, N] <= 4.0).all()
+def test_flux_index_and_place_are_the_gaussians_own() -> None:
+    host = posterior(0.01)
+    estimate, sd = image_estimate(host, "wide", 25.0), np.sqrt(np.diag(host.covariance))
+    assert estimate.magnitude.mean == pytest.approx(25.0 - 2.5 / math.log(10.0) * host.mean[0], rel=1e-12)
+    assert estimate.magnitude.sd == pytest.approx(2.5 / math.log(10.0) * sd[0], rel=1e-9)
+    for name, k in (("n", N), ("x", 5), ("y", 6)):
+        assert getattr(estimate, name).mean == pytest.approx(host.mean[k], rel=1e-9)
+        assert getattr(estimate, name).sd == pytest.approx(sd[k], rel=1e-9)
+    # The radius is normal in the logarithm: its interval is that of the logarithm.
+    low, high = estimate.r_eff.interval95
+    assert math.log(low) == pytest.approx(host.mean[1] - 1.959964 * sd[1], abs=1e-7)
+    assert math.log(high) == pytest.approx(host.mean[1] + 1.959964 * sd[1], abs=1e-7)
 
 
-def test_what_is_held_does_not_move_in_the_draws() -> None:
+@given(st.floats(0.3, 8.0), st.floats(0.01, 1.0))
+def test_the_estimate_is_finite_and_within_the_bounds_whatever_the_width(n: float, sd: float) -> None:
+    found = image_estimate(posterior(sd, min(max(n, 1.0), 4.0)).inside(1.0, 4.0), "free", 25.0)
+    for name in ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y"):
+        quantity = getattr(found, name)
+        assert math.isfinite(quantity.mean)
+        assert 0.0 <= quantity.sd < math.inf
+    assert 1.0 <= found.n.mean <= 4.0
+    # No distribution between two bounds is wider.
+    assert found.n.sd <= 1.5
+
+
+def test_what_is_held_does_not_move() -> None:
     host = posterior(low=2.0, high=2.0)
     covariance = host.covariance.copy()
     covariance[N] = covariance[:, N] = 0.0
-    held = replace(host, covariance=covariance)
-    assert (coordinates(held, 30)[:, N] == 2.0).all()
+    found = image_estimate(replace(host, covariance=covariance), "fixed", 25.0)
+    assert (found.n.mean, found.n.sd) == (2.0, 0.0)
 
 
-def test_a_prior_of_n_without_a_fit_has_no_draws_and_the_others_have() -> None:
-    wide, fixed = refit_image({"wide": posterior()}, ("wide", "fixed"), 5, 0)
-    assert all(fit is not None for fit in wide.fits)
-    assert fixed.fits == (None,) * 5
+def test_errors_that_are_larger_are_larger_in_everything() -> None:
+    host = posterior(0.01)
+    one, two = (image_estimate(each, "wide", 25.0) for each in (host, host.inflated(1.5)))
+    for name in ("magnitude", "n", "x"):
+        assert getattr(two, name).mean == pytest.approx(getattr(one, name).mean, rel=1e-9)
+        assert getattr(two, name).sd == pytest.approx(1.5 * getattr(one, name).sd, rel=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +123,6 @@ def test_the_wide_posterior_is_the_fit(fit: ParametricFit) -> None:
     wide = fit.hosts["wide"]
     for name in ("flux", "r_eff", "n", "q", "x", "y"):
         assert getattr(wide.profile, name) == pytest.approx(getattr(fit.host, name), rel=1e-10)
-    sd = np.sqrt(np.diag(fit.host_covariance))
-    assert math.sqrt(wide.covariance[0, 0]) == pytest.approx(sd[0] / fit.host.flux, rel=1e-10)
-    assert math.sqrt(wide.covariance[N, N]) == pytest.approx(sd[2], rel=1e-10)
 
 
 def test_a_fit_with_n_held_is_where_the_gaussian_says_and_narrower(fit: ParametricFit) -> None:

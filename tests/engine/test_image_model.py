@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from engine.conventions import ellipticity
 from engine.imaging.observation import Observation
-from engine.imaging.optics.extended import deposit_matrix
 from engine.imaging.optics.spline import place_spline, place_stamp, spline_coefficients
+from engine.imaging.optics.stamp_blur import deposit_matrix
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.parametric.model import ImageModel, Layout, components, weights_sigma
+from engine.parametric.model import ImageModel, weights_sigma
+from engine.parametric.parameters import ParameterSpace
 
 SCALE = 0.08
 
@@ -33,16 +35,16 @@ def values() -> np.ndarray:
     lens, host = PowerLawLens(0.8, 0.7, 0.4, 2.1, 0.02, -0.01), SersicProfile(1.0, 0.25, 1.5, 0.8, 1.0, 0.06, 0.04)
     agn = [0.7, 0.5, -0.6, -0.4]
     deflector = [math.log(0.6), 3.0, 0.05, 0.02, 0.011, -0.013]
-    mass = [lens.theta_E, *components(lens.q, lens.phi), lens.slope, lens.x, lens.y, 0.03, -0.02]
-    light = [math.log(host.r_eff), host.n, *components(host.q, host.phi), host.x, host.y]
+    mass = [lens.theta_E, *ellipticity(lens.q, lens.phi), lens.slope, lens.x, lens.y, 0.03, -0.02]
+    light = [math.log(host.r_eff), host.n, *ellipticity(host.q, host.phi), host.x, host.y]
     return np.array([*agn, *deflector, *mass, *light])
 
 
 def _model(observation: Observation, *, exact: bool, subrays: int = 2) -> ImageModel:
     ny, nx = observation.shape
     window = (slice(0, ny), slice(0, nx))
-    layout = Layout(2, deflector=True, shear=True)
-    return ImageModel(observation, layout, weights_sigma(observation), window, subrays=subrays, exact=exact)
+    space = ParameterSpace(2, deflector=True, shear=True)
+    return ImageModel(observation, space, weights_sigma(observation), window, subrays=subrays, exact=exact)
 
 
 def test_a_moved_stamp_keeps_its_light_and_its_whole_pixel_shape() -> None:
@@ -88,12 +90,12 @@ def test_rays_keep_their_light() -> None:
 
 def test_the_jacobian_is_that_of_the_residuals(observation: Observation, values: np.ndarray) -> None:
     model = _model(observation, exact=False)
-    layout = model.layout
+    space = model.space
     best, _, columns = model.amplitudes(values)
     given, amplitudes = model.full_jacobian(values)
     assert np.array_equal(amplitudes, best)
     step = 1e-5
-    for k in range(layout.size):
+    for k in range(space.size):
         ahead, behind = values.copy(), values.copy()
         ahead[k] += step
         behind[k] -= step
@@ -101,7 +103,7 @@ def test_the_jacobian_is_that_of_the_residuals(observation: Observation, values:
         size = np.abs(moved).max()
         # One-sided differences of steps of 1e-5 to 1e-3 against central ones.
         assert np.allclose(given[: moved.size, k], moved, rtol=0, atol=5e-3 * size), k
-    assert np.allclose(given[: columns.shape[0], layout.size :], columns)
+    assert np.allclose(given[: columns.shape[0], space.size :], columns)
     projected = model.jacobian(values)
     for column in columns.T:
         # Kaufman's form: nothing is left along the amplitudes' columns.

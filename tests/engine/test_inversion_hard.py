@@ -15,7 +15,7 @@ from engine.likelihood.evidence import MAX_CONDITION, invert, ln_evidence
 from engine.likelihood.problem import prepare_problem
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
-from engine.source.regularisation import SourceModel, regularisation_matrix
+from engine.source.regularisation import SourceModel, sparse_regularisation
 from engine.spec.analysis import Analysis
 from tests.engine.explicit_inversion import LENS, Explicit, stamp, stamp_likelihood
 from tests.engine.true_fit import bare_fit, true_fit
@@ -261,7 +261,7 @@ def test_a_problem_is_laid_out_with_a_psf_larger_than_the_image() -> None:
 def test_the_condition_number_is_the_true_one_within_a_factor_of_three(name: str, ln_lambda: float) -> None:
     model = SourceModel((12, 13), name)  # type: ignore[arg-type]
     inversion = invert(Explicit().likelihood(), LENS, ln_lambda, model)
-    a = inversion.curvature + math.exp(ln_lambda) * regularisation_matrix(model)
+    a = inversion.curvature + math.exp(ln_lambda) * sparse_regularisation(model).toarray()
     true = np.linalg.norm(a, 1) * np.linalg.norm(np.linalg.inv(a), 1)
     # LAPACK's estimate of the norm of the inverse is a lower bound, seldom below a third.
     assert true / 3 < inversion.condition_number < true * 1.001

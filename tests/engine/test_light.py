@@ -9,13 +9,12 @@ from scipy.optimize import brentq
 
 from engine.errors import SpecError
 from engine.lensing.lens_equation import solve_lens_equation
-from engine.lensing.power_law import PowerLawLens, convergence_and_shear, kernel_arguments, source_position
+from engine.lensing.power_law import PowerLawLens, convergence_and_shear, source_position
 from engine.light import radial_table, refinement, rendering
 from engine.light.brightness_bounds import brightness_range
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
-from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_lensed_sersic
-from engine.light.sersic import SersicProfile, mean_surface_brightness, sersic_k, surface_brightness
-from engine.light.sersic import kernel_arguments as sersic_arguments
+from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_sersic
+from engine.light.sersic import SersicProfile, mean_surface_brightness, sersic_constants, sersic_k, surface_brightness
 from engine.simulation.scene import build_scene
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
@@ -95,7 +94,7 @@ def test_the_radial_table_gives_the_brightness(n: float) -> None:
     rng = np.random.default_rng(1)
     r, angle = 0.3 * 10 ** rng.uniform(-9, 3, 200_000), rng.uniform(0, 2 * np.pi, 200_000)
     x, y = 0.1 + r * np.cos(angle), -0.2 + r * np.sin(angle)
-    u, v = to_profile_axes(x, y, sersic_arguments(profile))
+    u, v = to_profile_axes(x, y, sersic_constants(profile))
     ours, exact = brightness(u, v, tabulate(profile)), surface_brightness(profile, x, y)
     assert ours.min() >= 0.0
     assert np.abs(ours - exact).max() < 2e-7 * exact.max()
@@ -149,7 +148,7 @@ def test_the_bounds_hold_in_bent_parallelograms() -> None:
 
 def test_a_cell_is_integrated_by_the_nine_point_rule() -> None:
     profile = SersicProfile(1.0, 0.5, 1.0, 0.7, 0.4)
-    light, table = sersic_arguments(profile), tabulate(profile)
+    light, table = sersic_constants(profile), tabulate(profile)
     # Far from the cusp one cell is enough, and the rule is that of any textbook.
     nodes, weights = np.polynomial.legendre.leggauss(3)
     x, y = np.meshgrid(1.0 + 0.005 * nodes, 0.7 + 0.005 * nodes)
@@ -356,13 +355,16 @@ def test_sampled_rendering_is_the_mean_over_the_rays() -> None:
     lens = PowerLawLens(1.2, 0.8, 0.5, 2.1)
     profile = SersicProfile(10.0, 0.3, 2.0, 0.7, 0.3, 0.03, 0.05)
     x, y = np.linspace(-1, 1, 11), np.linspace(-0.8, 0.8, 9)
-    ours = sample_lensed_sersic(profile, lens, x, y, 0.2, 3)
+    rays_x, rays_y = (np.add.outer(axis, 0.2 * np.array([-1.0, 0.0, 1.0]) / 3.0).ravel() for axis in (x, y))
+    ours = sample_sersic(profile, lens, rays_x, rays_y, 0.2 / 3).reshape(9, 3, 11, 3).sum(axis=(1, 3))
     # The radial table is within 1e-7 of the profile here.
     assert np.allclose(ours, supersampled(profile, x, y, 0.2, 3, lens), rtol=1e-7)
 
 
-def test_the_kernels_take_what_kernel_arguments_gives() -> None:
-    packed, series = kernel_arguments(PowerLawLens(1.0, 0.8, 0.0, 2.0))
-    assert packed.shape == (9,)
-    assert series[0] == 1.0
+def test_whole_numbers_are_the_same_lens_and_the_same_profile_to_the_kernels() -> None:
+    lens, whole = PowerLawLens(1.0, 1.0, 0.0, 2.0), PowerLawLens(1, 1, 0, 2)
+    profile, round_one = SersicProfile(1.0, 1.0, 1.0, 1.0, 0.0), SersicProfile(1, 1, 1, 1, 0)
+    assert {type(value) for value in sersic_constants(round_one)} == {float}
+    expected = render_sersic(profile, GRID, GRID, 0.08, lens)
+    assert np.array_equal(render_sersic(round_one, GRID, GRID, 0.08, whole), expected)
     assert radial_table.tabulate(SersicProfile(1.0, 1.0, 1.0, 1.0, 0.0)).shape[1] == 4

@@ -45,7 +45,7 @@ def test_an_image_is_measured_without_being_told_what_is_in_it(simulation: Simul
     # The bounds are those of the errors that the measurement itself gives, tripled.
     assert found.host.magnitude.mean == pytest.approx(20.5, abs=3 * found.host.magnitude.sd)
     assert found.host.magnitude.interval95[0] < 20.5 < found.host.magnitude.interval95[1]
-    assert found.host.radius.mean == pytest.approx(0.39, abs=3 * found.host.radius.sd)
+    assert found.host.r_eff.mean == pytest.approx(0.39, abs=3 * found.host.r_eff.sd)
     assert found.host.n.mean == pytest.approx(2.0, abs=3 * found.host.n.sd)
     assert found.host.magnitude.sd < 0.1
     for name in ("theta_E", "q", "slope"):

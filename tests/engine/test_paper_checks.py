@@ -17,13 +17,13 @@ import pytest
 
 from engine.catalogue import load_system
 from engine.conventions import rate_to_magnitude
-from engine.estimators.draws import DrawSet, source_draw
+from engine.estimators.draws import source_draw
 from engine.estimators.refit import refit_draws
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.problem import prepare_problem
 from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum, optimal_strength, start_covariance
-from engine.run import prepare_target
+from engine.posterior.start import prepare_target
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
@@ -45,11 +45,11 @@ class Found:
 def find(simulation: Simulation, fit: ParametricFit, analysis: Analysis, lens: PowerLawLens) -> Found:
     """The source of highest posterior behind a lens, with the strength of highest evidence."""
     problem = prepare_problem(simulation.observation, fit, analysis)
-    target = prepare_target(problem, fit, analysis, shear=False)
+    target = prepare_target(problem, fit, analysis)
     inversion = target.invert(target.vector(lens, optimal_strength(target, lens)))
     rng = np.random.default_rng(0)
     draw = replace(source_draw(inversion, lens, rng), drawn=inversion.source)
-    refits = refit_draws(DrawSet((draw,), fit.hosts), ("paper",), None, rng)
+    refits = refit_draws([draw], ("paper",), None, rng)
     profile = next(refit for refit in refits if refit.index_prior == "free").fits[0]
     assert profile is not None
     arc = problem.likelihood.blurring @ inversion.lensing.apply(inversion.source.ravel())
@@ -90,7 +90,7 @@ def test_the_true_slope_finds_the_same_host_as_the_slope_of_highest_evidence(
     simulation: Simulation, fit: ParametricFit
 ) -> None:
     analysis = Analysis()
-    target = prepare_target(prepare_problem(simulation.observation, fit, analysis), fit, analysis, shear=False)
+    target = prepare_target(prepare_problem(simulation.observation, fit, analysis), fit, analysis)
     start = target.vector(fit.lens, optimal_strength(target, fit.lens))
     optimum = find_optimum(target, start, start_covariance(fit.lens_covariance))
     slope = target.prior.names.index("slope")

@@ -9,18 +9,22 @@ import pytest
 from engine.conventions import pixel_centres, rate_to_magnitude
 from engine.errors import ObservationError, PosteriorError
 from engine.imaging.observation import Observation
-from engine.imaging.optics.extended import StampBlur
 from engine.imaging.optics.spline import spline_coefficients
+from engine.imaging.optics.stamp import StampOptics
+from engine.imaging.optics.stamp_blur import StampBlur
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.problem import CORE_BOOST, prepare_problem, ring_mask
-from engine.parametric.fit import GOOD_START, ParametricFit, _at_bound, _Finder, fit_parametric
+from engine.parametric.fit import GOOD_START, ParametricFit, fit_parametric
 from engine.parametric.lens_start import lens_from_positions
-from engine.parametric.model import ImageModel, Layout, lens_of, sersic_of
+from engine.parametric.model import ImageModel
+from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import find_point_sources
-from engine.parametric.psf_error import measured_stamp_error
+from engine.parametric.refine import polished
+from engine.parametric.residual_noise import measured_stamp_error
+from engine.parametric.search import Task, find_starts, quick_fits
 from engine.parametric.starts import ring_radii
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
@@ -46,9 +50,9 @@ def test_the_agn_images_are_found_within_a_tenth_of_a_pixel(scene: Scene, simula
 
 
 def test_more_images_than_there_are_is_refused(simulation: Simulation) -> None:
-    flat = np.zeros(simulation.observation.shape)
-    with pytest.raises(ObservationError, match="agn"):
-        find_point_sources(flat, flat + 1.0, simulation.observation.psf, 0.08, 2)
+    flat = replace(simulation.observation, image=np.zeros(simulation.observation.shape))
+    with pytest.raises(ObservationError, match="agn: found 0 point sources of 2"):
+        find_starts(task_of(flat), 2, None, None)
 
 
 def test_a_lens_is_found_from_the_positions_of_a_quad_and_of_a_double() -> None:
@@ -156,9 +160,9 @@ def test_a_ring_without_valid_pixels_is_refused(simulation: Simulation, fit: Par
 
 def _lensed(observation: Observation, *, shear: bool = False) -> tuple[ImageModel, np.ndarray]:
     """A model of a host's arc and a deflector, without AGN, on an image of its own; and its parameters."""
-    layout = Layout(0, deflector=True, shear=shear)
+    space = ParameterSpace(0, deflector=True, shear=shear)
     whole = (slice(0, observation.shape[0]), slice(0, observation.shape[1]))
-    model = ImageModel(observation, layout, observation.noise, whole, subrays=2, exact=True)
+    model = ImageModel(observation, space, observation.noise, whole, subrays=2, exact=True)
     deflector = [math.log(0.9), 3.0, 0.05, 0.02, 0.0, 0.0]
     lens = [1.1, 0.09, 0.02, 1.95, 0.0, 0.0, *([0.03, -0.02] if shear else [])]
     return model, np.array([*deflector, *lens, math.log(0.25), 2.5, 0.1, 0.0, 0.03, 0.02])
@@ -174,9 +178,9 @@ def stamped(simulation: Simulation) -> Observation:
 
 def test_the_smoothing_by_sub_rays_is_not_counted_beside_that_of_the_psf(stamped: Observation) -> None:
     model, values = _lensed(stamped)
-    layout = model.layout
-    host, lens = sersic_of(values[layout.host_slice]), lens_of(values[layout.lens_slice])
-    arc = model.unwhitened(model.columns(values)[:, layout.amplitudes - 2, None], np.ones(1))
+    space = model.space
+    host, lens = space.host(values), space.lens(values)
+    arc = model.unwhitened(model.columns(values)[:, space.amplitudes - 2, None], np.ones(1))
     # Ten times as many rays, whose own smoothing is a hundredth.
     x = pixel_centres(61, 0.08)
     fine = StampBlur(spline_coefficients(stamped.psf), x, x, 0.08, 20, 0)
@@ -214,37 +218,58 @@ def test_the_error_of_a_stamp_is_read_off_the_residuals(error: float) -> None:
     stamps, others = 50.0 * np.exp(-0.5 * (x**2 + y**2) / 16.0), np.ones(x.shape)
     residual = rng.normal(size=x.shape) * np.sqrt(others + error**2 * stamps)
     # 250 pixels: their mean square is known to 9 %, its root to half of that.
-    assert measured_stamp_error(residual, stamps, others) == pytest.approx(error, rel=0.15)
+    assert measured_stamp_error(residual, stamps, others, StampOptics.error_range) == pytest.approx(error, rel=0.15)
 
 
 def test_residuals_that_no_stamp_explains_change_its_error_by_no_more_than_is_allowed() -> None:
     stamps, others = np.full((9, 9), 10.0), np.ones((9, 9))
-    assert measured_stamp_error(np.full((9, 9), 1e3), stamps, others) == 5.0
-    assert measured_stamp_error(np.zeros((9, 9)), stamps, others) == 0.5
-    assert measured_stamp_error(np.ones((9, 9)), 0.1 * others, others) is None
+    assert measured_stamp_error(np.full((9, 9), 1e3), stamps, others, (0.5, 5.0)) == 5.0
+    assert measured_stamp_error(np.zeros((9, 9)), stamps, others, (0.5, 5.0)) == 0.5
+    assert measured_stamp_error(np.ones((9, 9)), 0.1 * others, others, (0.5, 5.0)) is None
 
 
-def finder_of(observation: Observation) -> _Finder:
-    return _Finder(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
+def task_of(observation: Observation) -> Task:
+    return Task(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
 
 
 def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulation: Simulation) -> None:
     # Three pixels from where it is: its bounds are two pixels about where the fit begins.
     shift = 3.0 * simulation.observation.pixel_scale
     places = [(agn.x + (shift if k == 0 else 0.0), agn.y) for k, agn in enumerate(scene.agn)]
-    finder = finder_of(simulation.observation)
-    (group,) = finder.starts(None, None, places)
-    (found,) = finder.quick(group)
-    assert "agn1.x" in _at_bound(found)
-    (group,) = finder.starts(4, None, None)
-    (found,) = finder.quick(group)
-    assert not _at_bound(found)
+    task = task_of(simulation.observation)
+    (group,) = find_starts(task, None, None, places)
+    (found,) = quick_fits(task, group)
+    assert "agn1.x" in found.at_bound
+    (group,) = find_starts(task, 4, None, None)
+    (found,) = quick_fits(task, group)
+    assert not found.at_bound
+
+
+@pytest.mark.parametrize("name", ["agn1.x", "agn2.y", "lens.theta_E", "lens.x", "host.y", "deflector.x"])
+def test_what_strays_from_its_start_fit_by_fit_is_told(simulation: Simulation, name: str) -> None:
+    task = task_of(simulation.observation)
+    (group,) = find_starts(task, 4, None, None)
+    start = group[0]
+    (found,) = quick_fits(task, [start])
+    space = found.space
+    k = space.names.index(name)
+    low, high = space.bounds(start.vector(space), simulation.observation.pixel_scale, {})
+    # One fit ends just inside its bounds, and the next one, whose bounds lie round that, goes on from there.
+    away = found.values.copy()
+    away[k] = low[k] + 0.01 * (high[k] - low[k])
+    assert name not in replace(found, values=away).at_bound
+    away[k] = low[k] - 0.1 * (high[k] - low[k])
+    own_low, own_high = found.low.copy(), found.high.copy()
+    own_low[k], own_high[k] = away[k] - 1.0, away[k] + 1.0
+    again = replace(found, values=away, low=own_low, high=own_high)
+    assert not space.at_bound(away, own_low, own_high)
+    assert again.at_bound == (name,)
 
 
 def test_what_one_candidate_shows_of_its_stamps_is_not_taken_over_by_the_next(simulation: Simulation) -> None:
-    finder = finder_of(replace(simulation.observation, response=None, covariance=None))
-    (group,) = finder.starts(4, None, None)
-    (candidate,) = finder.quick(group)
-    once, again = finder.polish(candidate), finder.polish(candidate)
+    task = task_of(replace(simulation.observation, response=None, covariance=None))
+    (group,) = find_starts(task, 4, None, None)
+    (candidate,) = quick_fits(task, group)
+    once, again = polished(task, candidate), polished(task, candidate)
     assert once.stamp_error != 1.0
     assert np.array_equal(once.values, again.values)

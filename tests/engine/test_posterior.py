@@ -125,7 +125,7 @@ def test_a_surrogate_knows_what_it_was_told_and_nothing_outside_the_prior() -> N
     surrogate = learn_surrogate(known, target.prior, laplace, np.random.RandomState(0))
     points, values = np.array(known.points), np.array(known.values)
     near = values > values.max() - 7.0
-    # It ends its lessons at an error of 0.35 at places that it does not know yet.
+    # It stops learning at an error of 0.35 at places that it does not know yet.
     assert np.abs(surrogate.ln_density(points[near]) - values[near]).max() < 0.35
     assert surrogate.ln_density(np.full((1, 7), 60.0))[0] == -math.inf
     ends, _, _ = surrogate.walk(points[:9], 20, np.random.RandomState(1))
@@ -164,11 +164,13 @@ class Hills:
         return float(np.logaddexp(math.log(1.0 - self.weight) - 0.5 * values @ values, ln_other))
 
 
-def test_a_chain_that_sticks_is_a_lesson_and_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    lessons = []
+def test_a_chain_that_mixes_badly_is_restarted_and_the_surrogate_has_learnt_from_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known_before = []
 
     def counted(known, prior, laplace, random):
-        lessons.append(len(known.values))
+        known_before.append(len(known.values))
         return learn_surrogate(known, prior, laplace, random)
 
     monkeypatch.setattr("engine.posterior.chain.learn_surrogate", counted)
@@ -177,12 +179,12 @@ def test_a_chain_that_sticks_is_a_lesson_and_begins_anew(monkeypatch: pytest.Mon
         target, Laplace(np.zeros(5), np.eye(5), 0.0, 1), walkers=12, max_steps=600, rng=np.random.default_rng(1),
         progress=done.append,
     )  # fmt: skip
-    assert len(lessons) >= 2
+    assert len(known_before) >= 2
     # What the chain went through is what the surrogate learns from.
-    assert lessons[1] > lessons[0] + 12 * 60
+    assert known_before[1] > known_before[0] + 12 * 60
     summary = chain.summary
     assert summary.status == "converged"
-    # Steps that were a lesson are burn-in: all evaluations are accounted for, to half a step of all walkers.
+    # Steps before a restart are burn-in: all evaluations are accounted for, to half a step of all walkers.
     assert abs(summary.evaluations - summary.walkers * (summary.steps + summary.burn_in)) <= summary.walkers / 2
     x = chain.flat()[:, 0]
     assert x.mean() == pytest.approx(

@@ -14,15 +14,17 @@ from engine import (
     Realization,
     RunResult,
     SpecError,
+    analyse,
+    compare,
     generator,
     load_system,
-    measure,
     realization_from_dict,
     run,
 )
 from engine.figures import run_figure
-from engine.result import ESTIMATORS, INDEX_PRIORS
+from engine.result import INDEX_PRIORS
 from engine.simulation.simulate import Simulation, simulate_realization
+from engine.spec.analysis import ESTIMATORS
 
 
 @pytest.fixture(scope="module")
@@ -46,13 +48,17 @@ def test_a_run_reports_everything_finite(result: RunResult) -> None:
     assert result.aperture is not None
     assert math.isfinite(result.aperture.magnitude.mean)
     assert (result.regularisation, result.noise_treatment, result.profile) == ("curvature", "covariance", "standard")
+    assert result.ln_evidence is not None
+    assert result.condition_number is not None
     for number in (result.ln_evidence, result.chi2, result.condition_number, result.arc_magnitude):
         assert math.isfinite(number)
+    assert result.chain is not None
     assert result.chain.evaluations > 100
     assert len(result.engine_digest) == 64
 
 
 def test_a_chain_too_short_is_said_to_be(result: RunResult) -> None:
+    assert result.chain is not None
     assert result.chain.status == "not_converged"
     assert any("chain" in warning for warning in result.warnings)
 
@@ -78,8 +84,11 @@ def test_the_same_realization_gives_the_same_bits(realization: Realization, resu
     assert again.lens == result.lens
     assert again.products is not None
     assert result.products is not None
-    assert np.array_equal(again.products.source, result.products.source)
-    assert np.array_equal(again.products.chain, result.products.chain)
+    one, two = again.products.arrays(), result.products.arrays()
+    assert one.keys() == two.keys()
+    assert {"image", "residual", "source", "source_truth", "chain"} <= one.keys()
+    for name, values in one.items():
+        assert np.array_equal(values, two[name])
 
 
 def test_one_worker_and_two_give_the_same_bits(realization: Realization, result: RunResult) -> None:
@@ -104,29 +113,65 @@ def test_progress_names_the_stages_in_order(realization: Realization) -> None:
     assert seen == list(STAGES)
 
 
-def test_an_observation_without_a_truth_has_no_bias(simulation: Simulation, realization: Realization) -> None:
-    found = measure(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
+def test_an_analysis_is_blind_and_the_comparison_adds_the_truth_alone(
+    simulation: Simulation, realization: Realization
+) -> None:
+    found = analyse(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
     answered = [(e.estimator, e.index_prior) for e in found.estimates]
     assert answered == [(estimator, prior) for estimator in ESTIMATORS for prior in ("wide", "free")]
     assert all(estimate.magnitude.bias is None for estimate in found.estimates)
     assert all(parameter.value.truth is None for parameter in found.lens)
+    assert found.inversion is not None
+    assert found.inversion.source_plane.source_truth is None
+    told = compare(found, realization, simulation)
+    assert [e.magnitude.mean for e in found.estimates] == [e.magnitude.mean for e in told.estimates]
+    assert [p.value.sd for p in found.lens] == [p.value.sd for p in told.lens]
+    for estimate in told.estimates:
+        assert estimate.magnitude.bias == pytest.approx(estimate.magnitude.mean - 20.5)
 
 
-def test_the_truth_changes_nothing_but_the_biases(simulation: Simulation, realization: Realization) -> None:
-    from engine.run import Truth
-    from engine.simulation.scene import build_scene
+def test_image_alone_needs_no_chain_and_says_the_same(realization: Realization, result: RunResult) -> None:
+    seen: list[str] = []
+    alone = replace(realization, analysis=replace(realization.analysis, estimators=("image",)))
+    found = run(alone, lambda stage, _: seen.append(stage))
+    assert [stage.stage for stage in found.stages] == seen == list(STAGES[:2])
+    assert found.estimates == tuple(e for e in result.estimates if e.estimator == "image")
+    assert (found.chain, found.ln_evidence, found.condition_number, found.aperture) == (None, None, None, None)
+    # Of the parametric fit, whose noise map holds the errors of the PSF as well.
+    assert found.chi2 / found.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
+    slope = next(parameter.value for parameter in found.lens if parameter.name == "slope")
+    assert abs(slope.bias or 9.0) < 4.0 * slope.sd
+    assert found.products is not None
+    arrays = found.products.arrays()
+    assert {"image", "model", "arc_model", "residual", "mask"} <= arrays.keys()
+    assert not {"source", "chain"} & arrays.keys()
+    figure = run_figure(found)
+    assert len(figure.axes) == 6
 
-    scene = build_scene(realization)
-    blind = measure(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
-    told = measure(
-        simulation.observation,
-        realization.analysis,
-        generator(realization, 1),
-        agn_images=4,
-        truth=Truth(scene.lens, scene.host),
-    )
-    assert [e.magnitude.mean for e in blind.estimates] == [e.magnitude.mean for e in told.estimates]
-    assert np.array_equal(blind.products.chain, told.products.chain)
+
+def test_an_estimator_that_is_not_asked_for_has_no_answer(simulation: Simulation, realization: Realization) -> None:
+    asked = replace(realization.analysis, estimators=("projected",))
+    found = analyse(simulation.observation, asked, generator(realization, 1), agn_images=4)
+    assert {estimate.estimator for estimate in found.estimates} == {"projected"}
+    assert found.inversion is not None
+    # The aperture lies where `paper` puts it.
+    assert found.inversion.aperture is None
+    assert not any("aperture" in warning for warning in found.warnings)
+
+
+def test_a_prior_of_n_that_no_fit_of_the_image_meets_is_missing_with_a_warning(
+    simulation: Simulation, realization: Realization
+) -> None:
+    alone = replace(realization.analysis, estimators=("image",))
+    rng = np.random.default_rng(0)
+    whole = analyse(simulation.observation, alone, rng, agn_images=4, fixed_index=2.0)
+    fit = replace(whole.fit, hosts={"wide": whole.fit.hosts["wide"]})
+    found = analyse(simulation.observation, alone, rng, fit=fit, fixed_index=2.0)
+    assert found.estimates == whole.estimates[:1]
+    assert [warning.split(":")[0] for warning in found.warnings] == [
+        "image estimator, n free",
+        "image estimator, n fixed",
+    ]
 
 
 def test_a_system_of_ones_own_without_deflector_light_and_with_shear(realization: Realization) -> None:

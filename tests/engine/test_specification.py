@@ -1,6 +1,8 @@
 """Specifications, the catalogue and grids: what is accepted, what is refused and how it is told."""
 
 import json
+from dataclasses import replace
+from importlib.resources import files
 from typing import Any
 
 import pytest
@@ -8,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from engine import digest
 from engine.catalogue import (
     camera_names,
     load_camera,
@@ -19,7 +22,6 @@ from engine.catalogue import (
 )
 from engine.conventions import (
     image_angle,
-    intermediate_einstein_radius,
     magnitude_to_rate,
     paper_einstein_radius,
     position_angle,
@@ -243,11 +245,6 @@ def test_position_angles_go_there_and_back(angle: float) -> None:
     assert min(difference, 180 - difference) < 1e-9
 
 
-@given(q=st.floats(0.2, 1.0), slope=st.floats(1.3, 2.7))
-def test_einstein_radii_of_both_conventions_go_there_and_back(q: float, slope: float) -> None:
-    assert intermediate_einstein_radius(paper_einstein_radius(1.3, q, slope), q, slope) == pytest.approx(1.3)
-
-
 def test_the_papers_einstein_radius_is_seven_percent_off_at_q_0_6() -> None:
     # ENGINE.md gives 'up to 7 % apart at q = 0.6': eta = 0.8 ... 1.2 there.
     ratios = [paper_einstein_radius(1.0, 0.6, slope) for slope in (1.8, 2.0, 2.2)]
@@ -258,6 +255,31 @@ def test_magnitudes_and_rates_go_there_and_back() -> None:
     assert rate_to_magnitude(magnitude_to_rate(21.3, 25.9463), 25.9463) == pytest.approx(21.3)
     with pytest.raises(ValueError, match="rate"):
         rate_to_magnitude(0.0, 25.9)
+
+
+def test_estimators_are_left_out_where_all_are_wanted_and_have_one_order() -> None:
+    assert "estimators" not in HE0435.to_dict()["analysis"]
+    one, other = (
+        replace(HE0435, analysis=Analysis(estimators=names)) for names in (("image", "paper"), ("paper", "image"))
+    )
+    assert one.to_dict()["analysis"]["estimators"] == ["paper", "image"]
+    assert one.digest == other.digest != HE0435.digest
+    assert realization_from_dict(one.to_dict()) == one
+    assert one.observation_digest == HE0435.observation_digest
+    # The digest of this specification before there was the field.
+    assert HE0435.digest == "a89bc559c7ef9ce4b565071fab827c4f2eb82c037a4f5b999a4a02a9d5eb34a1"
+
+
+@pytest.mark.parametrize("names", [[], ["image", "image"], ["galfit"]])
+def test_estimators_that_make_no_sense_are_refused(names: list[str]) -> None:
+    with pytest.raises(SpecError, match="estimators"):
+        realization_from_dict(HE0435.to_dict() | {"analysis": {"estimators": names}})
+
+
+def test_another_picture_of_the_same_numbers_is_no_other_engine() -> None:
+    names = [name for name, _ in digest._walk(files("engine"))]
+    assert {"lensing/power_law.py", "catalogue/systems.yaml", "run.py"} <= set(names)
+    assert not [name for name in names if name.startswith("figures/")]
 
 
 def test_the_engine_digest_is_a_sha256_and_stays() -> None:

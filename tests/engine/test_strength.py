@@ -29,20 +29,12 @@ def brent(likelihood, model) -> float:
 
 
 @pytest.mark.parametrize("model", MODELS, ids=str)
-def test_the_strength_is_the_maximum_of_the_evidence_with_its_curvature(model: SourceModel) -> None:
+def test_the_strength_is_the_maximum_of_the_evidence(model: SourceModel) -> None:
     likelihood = Case(amplitudes=2).likelihood()
     best = brent(likelihood, model)
     found = find_strength(likelihood, LENS, model)
     # Asked for is 1e-3. Brent itself cannot do better than the square root of rounding in ln Z.
     assert found.ln_lambda == pytest.approx(best, abs=1e-3)
-    step = 0.05
-    values = [ln_evidence(likelihood, LENS, best + k * step, model) for k in (-2, -1, 0, 1, 2)]
-    # The five-point second difference is exact to step^4 / 90 of the sixth derivative.
-    numeric = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (12 * step**2)
-    # The last Newton step, below 0.03, is not followed by a factorisation.
-    assert found.curvature == pytest.approx(numeric, rel=0.003)
-    expected = invert(likelihood, LENS, best, model).effective_parameters()
-    assert found.effective_parameters == pytest.approx(expected, rel=0.005)
 
 
 @pytest.mark.parametrize("away", [-15.0, -6.0, -1.0, 0.0, 1.0, 6.0, 15.0])
@@ -51,7 +43,8 @@ def test_few_factorisations_find_the_strength_from_anywhere(away: float) -> None
     best = brent(likelihood, model)
     found = find_strength(likelihood, LENS, model, start=best + away)
     assert found.ln_lambda == pytest.approx(best, abs=1e-3)
-    assert found.factorisations <= (3 if abs(away) <= 1 else 6)
+    # Two to enclose the maximum, one more for each eight of ln lambda, and half a dozen by Brent.
+    assert found.factorisations <= (9 if abs(away) <= 6 else 11)
 
 
 def test_strong_regularisation_leaves_the_evidence_of_no_source() -> None:
@@ -86,7 +79,11 @@ def test_a_host_below_the_noise_is_inverted_and_its_strength_large() -> None:
     scene.linear = LinearData(faint_data, scene.covariance, scene.columns)
     faint = find_strength(scene.likelihood(), LENS, model)
     assert faint.ln_lambda > bright.ln_lambda + 2
-    assert 0 < faint.effective_parameters < 0.5 * bright.effective_parameters
+    decided = [
+        invert(data, LENS, strength.ln_lambda, model).effective_parameters()
+        for data, strength in ((scene.likelihood(), faint), (likelihood, bright))
+    ]
+    assert 0 < decided[0] < 0.5 * decided[1]
 
 
 def test_an_interval_the_wrong_way_round_is_refused() -> None:

@@ -8,7 +8,6 @@ from scipy import sparse
 
 from engine.errors import InversionError
 from engine.imaging.optics.stamp_matrix import blurring_matrix
-from engine.lensing.power_law import kernel_arguments
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.likelihood.evidence import ln_evidence
 from engine.likelihood.noise import factorise_noise
@@ -58,7 +57,7 @@ def ring_likelihood(correlation: float, amplitudes: int, extra: int = 0) -> Marg
 @pytest.mark.parametrize(("correlation", "amplitudes"), [(0.0, 0), (0.0, 4), (0.1, 3)])
 def test_the_curvature_matrix_equals_the_plain_one(correlation: float, amplitudes: int, shape: tuple[int, int]) -> None:
     likelihood = ring_likelihood(correlation, amplitudes)
-    mapping = map_rays(likelihood.rays, kernel_arguments(LENS_HERE), shape)
+    mapping = map_rays(likelihood.rays, LENS_HERE, shape)
     fast = np.tril(curvature_matrix(likelihood.w_tilde, likelihood.border, mapping))
     plain = plain_curvature(likelihood, mapping)
     # Both round each of some thousand products once.
@@ -78,7 +77,7 @@ def test_the_blocks_hold_the_whole_of_w_and_leave_out_what_does_not_interact(cor
 
 def test_a_column_of_the_blurring_that_is_no_pixel_takes_part_in_the_evidence() -> None:
     without, likelihood = ring_likelihood(0.0, 2), ring_likelihood(0.0, 2, extra=1)
-    mapping = map_rays(without.rays, kernel_arguments(LENS_HERE), (9, 9))
+    mapping = map_rays(without.rays, LENS_HERE, (9, 9))
     # One more row of L, which takes light from the third source pixel alone.
     more = LensingMatrix(
         mapping.grid,

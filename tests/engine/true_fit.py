@@ -22,7 +22,6 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         background=0.0,
         lens_names=names,
         lens_covariance=1e-6 * np.eye(len(names)),
-        host_covariance=1e-6 * np.eye(7),
         hosts={},
         stamp_error=1.0,
         at_bound=(),
@@ -31,7 +30,6 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         sigma=np.full(shape, np.inf),
         chi2=0.0,
         degrees_of_freedom=1,
-        evaluations=0,
     )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from distributed import KilledWorker
+from distributed.client import ClosedClientError
 from sqlalchemy.exc import DataError, InternalError, OperationalError, StatementError
 
 from engine import engine_digest
@@ -195,6 +196,18 @@ def test_a_result_is_kept_while_the_database_is_away_and_nothing_is_claimed_mean
     assert setting.grids.grid(setting.grid_id).state is GridState.DONE
     assert len(setting.pool.submitted) == len(set(setting.pool.submitted)) == 6
     assert setting.queue.events[:7] == ["claim", "claim", "away", "away", "away", "store", "claim"]
+
+
+def test_a_dispatcher_outlives_the_moment_in_which_dasks_client_closes_itself(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def closed(_: Answered) -> None:
+        raise ClosedClientError("Client is closed. Can't send cancel-keys message.")
+
+    monkeypatch.setattr(Answered, "cancel", closed)
+    setting = Setting(database, InstantPool(tmp_path, "lost", "cancelled"), runs=3, reconcile_s=0.02)
+    setting.run()
+    assert setting.grids.grid(setting.grid_id).counts.done == 3
 
 
 def test_a_run_that_dask_has_lost_is_run_again_uncharged(database: Database, tmp_path: Path) -> None:

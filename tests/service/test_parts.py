@@ -20,17 +20,19 @@ from typer.testing import CliRunner
 
 import engine.figures
 from engine.result import (
-    ESTIMATORS,
     INDEX_PRIORS,
     Aperture,
     ChainSummary,
     Estimate,
+    ImagePlane,
     LensParameter,
+    Products,
     Quantity,
     RunResult,
+    SourcePlane,
     StageTime,
 )
-from engine.spec.analysis import Analysis
+from engine.spec.analysis import ESTIMATORS, Analysis
 from service.api.app import create_app
 from service.cli.app import app
 from service.dispatcher.identity import is_dead, own_name
@@ -81,6 +83,17 @@ def engine_result(**changes: Any) -> RunResult:
         "stages": (StageTime("forward", 1.0, 0.5), StageTime("posterior", 2.0, 2.0)),
     }
     return RunResult(**(whole | changes))
+
+
+def test_a_result_without_a_chain_is_a_payload_too() -> None:
+    image = [found for found in engine_result().estimates if found.estimator == "image"]
+    lone = engine_result(
+        estimates=tuple(image), chain=None, ln_evidence=None, condition_number=None, aperture=None
+    )  # fmt: skip
+    payload = ResultPayload.model_validate_json(result_payload(lone).model_dump_json())
+    assert (payload.chain, payload.ln_evidence, payload.condition_number, payload.aperture) == (None,) * 4
+    assert {name for name, found in payload.estimates.items() if found} == {"image_wide", "image_free", "image_fixed"}
+    assert payload.chi2 == 5.0
 
 
 def test_an_engine_result_becomes_a_payload_that_survives_json() -> None:
@@ -214,8 +227,9 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     flat = np.zeros((4, 5))
-    values = {"image": flat, "model": flat, "source_truth": None, "names": ("a", "b")}
-    products = dataclasses.make_dataclass("Products", list(values))(**values)
+    image = ImagePlane(flat, flat, flat, flat, flat, flat > 0, 0.08)
+    edges, samples = np.arange(6.0), np.zeros((2, 1))
+    products = Products(image, SourcePlane(flat, flat, edges, edges[:5], samples, ("theta_E",)))
     digest = planned(1)[0].digest
     monkeypatch.setattr(
         engine, "run", lambda realization: engine_result(realization_digest=realization.digest, products=products)
@@ -228,7 +242,8 @@ def test_the_worker_runs_the_engine_and_keeps_figure_and_arrays(
     assert payload.products is not None
     assert store.read(payload.figure.key).startswith(b"\x89PNG")
     with np.load(store.path(payload.products.key), allow_pickle=False) as arrays:
-        assert set(arrays) == {"image", "model", "names"}
+        assert {"image", "model", "mask", "pixel_scale", "source", "chain", "parameter_names"} <= set(arrays)
+        assert not {"source_truth", "source_plane"} & set(arrays)
         assert arrays["image"].shape == (4, 5)
 
 

@@ -769,7 +769,7 @@ def test_a_run_whose_specification_nobody_can_read_fails_with_its_reason_and_kee
     """Only a change by hand makes such a row; PostgreSQL itself refuses text that is no JSON, but not a list."""
     grid_id = submit(grids, 3)
     broken = grids.runs(grid_id, 3).items[0].id
-    spoilt = "'[1, 2'" if database.url.startswith("sqlite") else "'[1, 2]'::json"
+    spoilt = "'[1, 2'" if database.url.drivername.startswith("sqlite") else "'[1, 2]'::json"
     with database.write() as connection:
         connection.execute(text(f"UPDATE run SET spec = {spoilt} WHERE id = :id"), {"id": broken})  # noqa: S608
     leases = queue.claim(generation, 10)

@@ -77,7 +77,6 @@ def test_a_worker_that_never_answers_its_greeting_is_replaced(tmp_path: Path) ->
         "HOSTLENS_TASK": "tests.service.hostile:answer",
         "HOSTLENS_DRILL_HARM": str(harm),
         "HOSTLENS_WORKERS": "1",
-        **_PATIENCE,
     }
     # It waits for a worker that computes.
     with serving(tmp_path, **settings) as service:

@@ -1,4 +1,4 @@
-"""How an image answers to a point source: exactly where its exposures are known, by its PSF stamp where not.
+"""Optics of an image whose exposures are known: light goes through the same dithers and the same drizzle.
 
 Drizzling is not a convolution. Beside a bright AGN the difference between its true image and a shifted PSF stamp is
 many times the noise, so an observation whose dithers and optical PSF are known carries them along.
@@ -6,30 +6,75 @@ many times the noise, so an observation whose dithers and optical PSF are known 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
+from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.imaging.convolution import convolve, point_source_image
+from engine.imaging.cusps import place_cusps
 from engine.imaging.drizzling import drizzle
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry
+from engine.imaging.optics.exposed_matrix import exposed_blurring_matrix
+from engine.imaging.optics.interface import Pixels
+from engine.lensing.lens_equation import solve_lens_equation
+from engine.lensing.power_law import PowerLawLens
+from engine.light.rendering import render_sersic
+from engine.light.sersic import SersicProfile
+
+_AGN_ERROR = 0.002
+"""Error of an AGN's light as a fraction of it: what errors of position leave."""
 
 
 @dataclass(frozen=True, eq=False)
-class PointResponse:
-    """The exposures behind a drizzled image: optical PSF on sub-pixels, sampling, 3 x 3 detector kernel."""
+class ExposedOptics:
+    """The exposures behind a drizzled image; an :class:`~engine.imaging.optics.interface.ImageOptics`.
+
+    ``psf`` is the optical PSF on the sub-pixels of ``geometry`` (odd square), ``detector_kernel`` (3, 3).
+    """
 
     psf: FloatArray
     geometry: Geometry
     detector_kernel: FloatArray
 
-    def image(self, x: float, y: float) -> FloatArray:
+    correction_rounds: ClassVar[int] = 2
+    error_range: ClassVar[tuple[float, float]] = (1.0, 1.0)
+    error_correlation: ClassVar[float] = 0.0
+    misfit_is_noise: ClassVar[bool] = False
+    star_radius: ClassVar[float] = math.inf
+
+    def point_source(self, x: float, y: float) -> FloatArray:
         """Drizzled image (ny, nx) of a point source of unit flux at (x, y) [arcsec, image frame]."""
         star = point_source_image(np.array([[x, y]]), np.ones(1), self.psf, self.geometry)
         return drizzle(expose(star, self.geometry, self.detector_kernel), self.geometry)
 
-    def extended_image(self, light: FloatArray) -> FloatArray:
-        """Drizzled image (ny, nx) of light on the high-resolution grid, integrated over its sub-pixels."""
-        return drizzle(expose(convolve(light, self.psf), self.geometry, self.detector_kernel), self.geometry)
+    def sersic_image(self, profile: SersicProfile, lens: PowerLawLens | None = None) -> FloatArray:
+        """Drizzled image (ny, nx) [e-/s per pixel] of a Sersic profile, behind a lens or not."""
+        geometry = self.geometry
+        light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens)
+        if lens is None:
+            cusps = [(profile.x, profile.y)]
+        else:
+            cusps = [(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)]
+        blurred = convolve(place_cusps(light, profile, cusps, geometry, lens), self.psf)
+        return drizzle(expose(blurred, geometry, self.detector_kernel), geometry)
+
+    def blurring_matrix(self, to: Pixels, of: Pixels, subrays: int | None, radius: int) -> sparse.csr_matrix:
+        """B (len(to), len(of)): each pixel's own PSF, dithers, drizzle and all."""
+        return exposed_blurring_matrix(self.psf, self.geometry, self.detector_kernel, to, of, subrays, radius)
+
+    def agn_variance(self, light: FloatArray) -> FloatArray:
+        """Variance (ny, nx) that errors of the AGN's positions leave."""
+        return np.asarray((_AGN_ERROR * light) ** 2)
+
+    def extended_variance(self, light: FloatArray) -> FloatArray:
+        """Nothing: through its exposures extended light is exact."""
+        return np.zeros(light.shape)
+
+    def data_variance(self, noise: FloatArray, fit: FloatArray, misfit: float) -> FloatArray:  # noqa: ARG002
+        """The variances (M,) of the noise alone."""
+        return noise

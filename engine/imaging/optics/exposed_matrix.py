@@ -14,9 +14,8 @@ from scipy import fft, sparse
 from engine.compiled import kernel
 from engine.conventions import FloatArray
 from engine.imaging.drizzling import drizzle_weights
-from engine.imaging.optics.exposed import PointResponse
-
-Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+from engine.imaging.geometry import Geometry
+from engine.imaging.optics.interface import Pixels
 
 _NODES = 8
 """Sub-pixels along each axis between which the response is interpolated: Lagrange polynomials of order 7."""
@@ -26,16 +25,17 @@ _GUARD = 16
 """Sub-pixels of zeros round the PSF, against wrapping."""
 
 
-def _native_response(response: PointResponse, spacing: float, subrays: int | None) -> FloatArray:
+def _native_response(
+    psf: FloatArray, geometry: Geometry, detector_kernel: FloatArray, spacing: float, subrays: int | None
+) -> FloatArray:
     """Response of a native pixel, by the offset [sub-pixels] of its first sub-pixel from the light: odd square.
 
     The light is a pixel's mean over ``subrays`` rays a side, or its integral (None), ``spacing`` sub-pixels wide: the
     PSF is divided by the transfer function of that average, because the light has been smoothed by it already.
     """
-    geometry = response.geometry
     factor = geometry.oversampling
     pad = _GUARD + 2 * factor
-    psf = np.pad(response.psf, pad)
+    psf = np.pad(psf, pad)
     fy, fx = fft.fftfreq(psf.shape[0]), fft.rfftfreq(psf.shape[1])
 
     def transfer(f: FloatArray) -> FloatArray:
@@ -46,7 +46,7 @@ def _native_response(response: PointResponse, spacing: float, subrays: int | Non
         return np.asarray(np.sinc(f) * native / np.maximum(smoothed, _LEAST_TRANSFER))
 
     detector = np.zeros((fy.size, fx.size), dtype=np.complex128)
-    for (j, i), weight in np.ndenumerate(response.detector_kernel):
+    for (j, i), weight in np.ndenumerate(detector_kernel):
         shift = np.exp(-2j * np.pi * factor * (fy[:, None] * (j - 1) + fx[None, :] * (i - 1)))
         detector += weight * shift
     spectrum = fft.rfft2(psf) * detector * transfer(fy)[:, None] * transfer(fx)[None, :]
@@ -99,6 +99,13 @@ def _fill_matrix(
     at_column: FloatArray,
     radius: int,
 ) -> None:
+    """Responses of M pixels to the light of p others, written into ``out`` (M, p), zero beyond ``radius`` pixels.
+
+    ``native`` (n, n) is that of a native pixel by sub-pixel offset. Pixel m takes native pixels ``indptr[m]`` to
+    ``indptr[m + 1]``, whose first sub-pixels are at ``first_row`` and ``first_column`` (e,), with ``shares`` (e,).
+    ``to_row``, ``to_column`` (M,), ``of_row`` and ``of_column`` (p,) are pixels of the image; ``at_row`` and
+    ``at_column`` (p,) say where the light stands, in sub-pixels.
+    """
     size = native.shape[0]
     centre = size // 2
     half_shifted, shifted = np.empty((size, size)), np.empty((size, size))
@@ -118,13 +125,20 @@ def _fill_matrix(
 
 
 def exposed_blurring_matrix(
-    response: PointResponse, to: Pixels, of: Pixels, subrays: int | None, radius: int
+    psf: FloatArray,
+    geometry: Geometry,
+    detector_kernel: FloatArray,
+    to: Pixels,
+    of: Pixels,
+    subrays: int | None,
+    radius: int,
 ) -> sparse.csr_matrix:
     """B of shape (len(to), len(of)): what drizzled pixel ``to`` receives of the light of pixel ``of``.
 
     Parameters
     ----------
-    response : PointResponse
+    psf, geometry, detector_kernel
+        Of :class:`~engine.imaging.optics.exposed.ExposedOptics`.
     to, of : (rows, columns)
         Pixels of the drizzled image.
     subrays : int or None
@@ -132,9 +146,8 @@ def exposed_blurring_matrix(
     radius : int
         Pixels farther apart than this along either axis do not see each other.
     """
-    geometry = response.geometry
     scale = geometry.drizzled_scale / geometry.subpixel_scale
-    native = _native_response(response, scale, subrays)
+    native = _native_response(psf, geometry, detector_kernel, scale, subrays)
     reach = int(np.ceil((radius + 1) * geometry.drizzled_scale / geometry.subpixel_scale)) + 4 * geometry.oversampling
     if reach < native.shape[0] // 2:
         cut = native.shape[0] // 2 - reach

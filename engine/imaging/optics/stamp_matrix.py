@@ -9,11 +9,11 @@ divided, in Fourier space, by the transfer function of that average.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, sparse
 
 from engine.conventions import FloatArray
 from engine.errors import ObservationError
+from engine.imaging.optics.interface import Pixels
 
 
 def _average_transfer(frequencies: FloatArray, subrays: int | None) -> FloatArray:
@@ -51,9 +51,7 @@ def central_stamp(psf: FloatArray, radius: int) -> FloatArray:
     return psf[cy - ry : cy + ry + 1, cx - rx : cx + rx + 1].copy()
 
 
-def blurring_matrix(
-    kernel: FloatArray, to: tuple[NDArray[np.intp], NDArray[np.intp]], of: tuple[NDArray[np.intp], NDArray[np.intp]]
-) -> sparse.csr_matrix:
+def blurring_matrix(kernel: FloatArray, to: Pixels, of: Pixels) -> sparse.csr_matrix:
     """Sparse B of shape (len(to), len(of)): what pixel ``to`` (rows, columns) receives of the light of pixel ``of``."""
     cy, cx = kernel.shape[0] // 2, kernel.shape[1] // 2
     # Where each pixel of ``of`` stands in an image that is padded by the kernel, minus one elsewhere.

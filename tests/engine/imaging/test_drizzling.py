@@ -1,12 +1,10 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from engine.errors import ObservationError
 from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.drizzled_psf import drizzled_psf
-from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance, drizzled_variance
+from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import resized
 
@@ -75,46 +73,12 @@ def test_weights_repeat_the_package(setup):
     np.testing.assert_allclose(again, image, rtol=2e-6)  # the package adds up in single precision
 
 
-@pytest.mark.parametrize("kernel", ["turbo", "gaussian", "point"])
-def test_weights_repeat_the_package_for_the_other_kernels(f160w, kernel):
-    geometry = replace(resized(f160w.geometry, (40, 42)), kernel=kernel, pixfrac=1.0)
-    exposures = np.random.default_rng(5).random((geometry.n_dither, *geometry.native_shape))
-    try:
-        weights = drizzle_weights(geometry)
-    except ObservationError:
-        assert kernel == "point"  # leaves holes
-        return
-    np.testing.assert_allclose(
-        (weights @ exposures.ravel()).reshape(geometry.drizzled_shape),
-        drizzle(exposures, geometry),
-        rtol=3e-6,
-    )
-
-
-def test_weight_maps_give_the_weighted_mean(f160w):
-    geometry = f160w.geometry
-    shape = (geometry.n_dither, *geometry.native_shape)
-    exposures = np.broadcast_to(np.arange(1.0, 9.0)[:, None, None], shape).copy()
-    only_third = np.full(shape, 1e-6)
-    only_third[2] = 1.0
-    image = drizzle(exposures, geometry, only_third)
-    centre = image[49, 49] / geometry.drizzle_ratio**2
-    assert centre == pytest.approx(3.0, abs=1e-3)
-    with pytest.raises(ObservationError, match="drizzle weights"):
-        drizzle(exposures, geometry, only_third[:1])
-
-
-def test_covariance_and_variance_match_noise_draws(f160w):
+def test_the_covariance_is_that_of_noise_draws(f160w):
     geometry = resized(f160w.geometry, (24, 24))
     rng = np.random.default_rng(6)
     variance = rng.uniform(0.5, 2.0, (geometry.n_dither, *geometry.native_shape))
     covariance = drizzled_covariance(variance, geometry)
     assert abs(covariance - covariance.T).max() == 0
-    np.testing.assert_allclose(
-        covariance.diagonal().reshape(geometry.drizzled_shape),
-        drizzled_variance(variance, geometry),
-        rtol=1e-12,
-    )
     weights, draws = drizzle_weights(geometry), 3000
     images = (weights @ (rng.standard_normal((variance.size, draws)) * np.sqrt(variance.ravel())[:, None])).reshape(
         *geometry.drizzled_shape, draws
@@ -131,44 +95,34 @@ def test_noise_draws_through_the_package_match_the_variance_map(f160w):
     geometry = f160w.geometry
     rng = np.random.default_rng(8)
     shape = (geometry.n_dither, *geometry.native_shape)
-    wanted = drizzled_variance(np.ones(shape), geometry)
+    wanted = drizzled_covariance(np.ones(shape), geometry).diagonal().reshape(geometry.drizzled_shape)
     residuals = [drizzle(rng.standard_normal(shape), geometry) / np.sqrt(wanted) for _ in range(40)]
     # 40 x 9604 correlated pixels: the deviation is known to about 0.4 %.
     assert np.std(residuals) == pytest.approx(1, abs=0.01)
 
 
 def test_wrong_exposures_are_refused(f160w):
-    for function in (drizzle, drizzled_variance, drizzled_covariance):
+    for function in (drizzle, drizzled_covariance):
         with pytest.raises(ObservationError, match="exposures"):
             function(np.zeros((8, 3, 3)), f160w.geometry)
 
 
-def test_drizzled_psf_is_centred_and_keeps_the_light(setup, request):
-    name = request.node.callspec.params["setup"]
+def test_drizzled_psf_is_centred_and_keeps_the_light(setup):
     radius = 12
-    result = drizzled_psf(setup.psf, setup.geometry, setup.kernel, radius)
-    assert result.psf.shape == result.phase_error.shape == (2 * radius + 1,) * 2
-    assert result.oversampled.shape == (2 * radius * 4 + 1,) * 2
-    for array in (result.psf, result.oversampled):
-        assert np.unravel_index(np.argmax(array), array.shape) == (len(array) // 2,) * 2
-        assert 0.8 * setup.psf.sum() < array.sum() < setup.psf.sum()
-    assert result.psf.sum() == pytest.approx(result.oversampled.sum(), rel=3e-3)
-    # The spread between phases: measured 0.6 % of the peak for F160W, 1.8 % for ACS whose pixels undersample.
-    bound = {"F160W": 0.008, "F160W-sixth": 0.005, "UVIS": 1e-3, "ACS": 0.022}[name]
-    assert result.phase_error.max() < bound * result.psf.max()
+    psf = drizzled_psf(setup.psf, setup.geometry, setup.kernel, radius)
+    assert psf.shape == (2 * radius + 1,) * 2
+    assert np.unravel_index(np.argmax(psf), psf.shape) == (radius, radius)
+    assert 0.8 * setup.psf.sum() < psf.sum() < setup.psf.sum()
 
 
-def test_oversampled_psf_predicts_a_star_at_its_phases(setup, request):
-    # A star a quarter of a drizzled pixel off the grid, elsewhere on the image than those the PSF was made
-    # of.
+def test_a_star_differs_from_the_drizzled_psf_by_no_more_than_its_phase_makes(setup, request):
     name = request.node.callspec.params["setup"]
     geometry, radius = setup.geometry, 10
-    result = drizzled_psf(setup.psf, geometry, setup.kernel, radius)
+    psf = drizzled_psf(setup.psf, geometry, setup.kernel, radius)
     x, y = geometry.drizzled_axes()
     row, column = len(y) // 2 + 5, len(x) // 2 - 3
-    position = [x[column] + 0.25 * geometry.drizzled_scale, y[row]]
-    image = drizzle(star(setup, position), geometry)
-    cut = image[row - radius : row + radius + 1, column - radius + 1 : column + radius + 1]
-    predicted = 16 * result.oversampled[::4, 3::4]
-    bound = {"F160W": 0.02, "F160W-sixth": 0.02, "UVIS": 1e-3, "ACS": 1e-6}[name]
-    np.testing.assert_allclose(cut, predicted, atol=bound * predicted.max())
+    image = drizzle(star(setup, [x[column], y[row]]), geometry)
+    cut = image[row - radius : row + radius + 1, column - radius : column + radius + 1]
+    # Measured, rounded up: pixels of ACS undersample a star.
+    bound = {"F160W": 0.03, "F160W-sixth": 0.02, "UVIS": 4e-3, "ACS": 0.06}[name]
+    np.testing.assert_allclose(cut, psf, atol=bound * psf.max())

@@ -117,14 +117,14 @@ def test_files_that_are_not_observations_are_refused(tmp_path):
 
 def test_the_exposures_behind_an_observation_are_kept(tmp_path):
     from engine.imaging.geometry import exposure_geometry
-    from engine.imaging.optics.exposed import PointResponse
+    from engine.imaging.optics.exposed import ExposedOptics
 
     geometry = exposure_geometry(load_camera("WFC3-IR_F160W"), load_dither("eight_point_quarter_pixel"), (12, 12))
     grid = np.arange(21) - 10
     psf = np.exp(-0.5 * np.add.outer(grid**2, grid**2) / 2.5**2)
     kernel = np.array([[0.0, 0.02, 0.0], [0.02, 0.92, 0.02], [0.0, 0.02, 0.0]])
     image = np.ones((12, 12))
-    whole = Observation(image, image, np.ones((3, 3)), 0.08, 25.9, response=PointResponse(psf, geometry, kernel))
+    whole = Observation(image, image, np.ones((3, 3)), 0.08, 25.9, response=ExposedOptics(psf, geometry, kernel))
     write_observation(tmp_path / "o.fits", whole)
     again = read_observation(tmp_path / "o.fits")
     assert again.response.geometry == geometry

@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.psf_figures import effective_psf, encircled_energy, full_width_half_maximum
 from engine.catalogue import load_camera, read_catalogue
 from engine.errors import SpecError
 from engine.imaging.psf import (
     detector_kernel,
-    effective_psf,
-    encircled_energy,
-    full_width_half_maximum,
     telescope_psf,
 )
 from engine.imaging.pupil import annular_zernike, pupil_transmission

@@ -1,27 +1,12 @@
-"""Images of extended light as an observation shows them, exactly: the yardstick for quicker ways.
-
-Where the exposures are known, the light goes through the same dithers and drizzle; otherwise through the PSF stamp,
-interpolated by a cubic B-spline, and light is laid on the pixels by the weights of the same spline.
-"""
+"""Light on sub-pixels through a PSF stamp, both interpolated by the same cubic B-spline."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy import fft, sparse
 
-from engine.conventions import FloatArray, pixel_centres
-from engine.imaging.cusps import place_cusps
-from engine.imaging.observation import Observation
-from engine.imaging.optics.spline import spline_coefficients, spline_weights
-from engine.lensing.lens_equation import solve_lens_equation
-from engine.lensing.power_law import PowerLawLens
-from engine.light.rendering import render_sersic
-from engine.light.sersic import SersicProfile
-
-_OVERSAMPLING = 5
-"""Sub-pixels along a pixel of an image whose exposures are not known."""
-_OUTSIDE = 12
-"""Pixels beyond such an image whose light is carried into it."""
+from engine.conventions import FloatArray
+from engine.imaging.optics.spline import spline_weights
 
 
 def deposit_matrix(pixels: int, subrays: int) -> sparse.csr_matrix:
@@ -76,22 +61,3 @@ class StampBlur:
         blurred = fft.irfft2(fft.rfft2(laid, self._fft_shape) * kernel, self._fft_shape)
         k, (ny, nx) = self._outside, self._shape
         return np.asarray(blurred[k : k + ny, k : k + nx])
-
-
-def lensed_sersic_image(
-    observation: Observation, profile: SersicProfile, lens: PowerLawLens | None = None
-) -> FloatArray:
-    """Image (ny, nx) [e-/s per pixel] of a Sersic profile, behind a lens or not, in an observation."""
-    if observation.response is None:
-        ny, nx = observation.shape
-        scale = observation.pixel_scale
-        axes = pixel_centres(nx, scale), pixel_centres(ny, scale)
-        blur = StampBlur(spline_coefficients(observation.psf), *axes, scale, _OVERSAMPLING, _OUTSIDE)
-        return blur(render_sersic(profile, blur.x, blur.y, blur.side, lens), integrated=True)
-    geometry = observation.response.geometry
-    light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens)
-    if lens is None:
-        cusps = [(profile.x, profile.y)]
-    else:
-        cusps = [(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)]
-    return observation.response.extended_image(place_cusps(light, profile, cusps, geometry, lens))

@@ -1,0 +1,159 @@
+"""From quick fits to the fit of the whole image: which of them to go on with, the noise map, shear, exact light."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from operator import attrgetter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engine.conventions import FloatArray, pixel_centres
+from engine.lensing.power_law import PowerLawLens
+from engine.parametric.model import ImageModel, weights_sigma
+from engine.parametric.parameters import ParameterSpace
+from engine.parametric.point_sources import Detection
+from engine.parametric.residual_noise import measured_stamp_error, noise_scale
+from engine.parametric.search import Task, agn_light
+from engine.parametric.solution import INTEGRATED_STEPS, TOLERANCE, Solution, minimise
+from engine.parametric.uncertainty import parameter_covariance
+
+SUBRAYS = 2
+_STEPS = 40
+_SAMPLED_TOLERANCE = 1e-4
+"""Relative change of cost or parameters at which a fit with derivatives of samples ends."""
+_HOPELESS = 2.0
+"""Times what is acceptable from which on a fit is not worth the derivatives of integrated light."""
+_SHEAR_SHOWS = 4.0
+"""Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
+
+Dropping a shear that there is biases all of the lens, keeping one that there is not costs a little precision.
+"""
+_RIVAL = 2.0
+"""BIC of a quick fit, of that of the best, up to which another number of AGN images is still a rival."""
+_BORDER = 3
+_RADII, _LEAST_RADIUS = 3.0, 2.5
+"""The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
+_FEWEST_RADII = 2.2
+"""Einstein radii that are fitted even where stamps of AGN images end in them."""
+
+
+def ranked(task: Task, groups: list[list[Solution]]) -> list[Solution]:
+    """The two solutions to go on with, the better one first.
+
+    A quick fit takes the cusp of a host, or what shear does to an arc, for AGN images; so the best quick fits with
+    each number of them that is not out of the question, and that without, are compared as fits of full accuracy
+    on one noise map.
+    """
+    best = sorted(
+        (min(group, key=attrgetter("information")) for group in groups if group), key=attrgetter("information")
+    )
+    if len(best) == 1:
+        return sorted((solution for group in groups for solution in group), key=attrgetter("information"))[:2]
+    with_agn = [solution for solution in best if solution.space.n_agn]
+    chosen = [solution for solution in best if not solution.space.n_agn]
+    chosen += [s for s in with_agn if s.information < _RIVAL * with_agn[0].information]
+    if len(chosen) < 2:
+        return best[:2]
+    sigma = _sigma(task, with_agn[0] if with_agn else chosen[0])
+    full = [_full(task, solution, sigma, shear=task.may_shear) for solution in chosen]
+    return sorted(full, key=attrgetter("information"))[:2]
+
+
+def polished(task: Task, solution: Solution) -> Solution:
+    """The fit of the whole image from another one; with shear where it is wanted, or is worth its parameters."""
+    best = _full(task, solution, _sigma(task, solution), shear=task.may_shear)
+    error = _stamp_error(task, best)
+    if error is not None and error != best.stamp_error:
+        best = replace(best, stamp_error=error)
+        best = _full(task, best, _sigma(task, best), shear=task.may_shear)
+    if task.shear is None and not _shear_shows(best):
+        best = _full(task, best, best.model.sigma, shear=False)
+    for _ in range(task.observation.optics.correction_rounds):
+        best = _again(best, best.model.corrected(best.values))
+    return best
+
+
+def _full(task: Task, solution: Solution, sigma: FloatArray, *, shear: bool) -> Solution:
+    """The fit of the whole image that begins where another ended."""
+    ny, nx = task.observation.shape
+    space: ParameterSpace = replace(solution.space, shear=shear)
+    whole = slice(0, ny), slice(0, nx)
+    model = ImageModel(task.observation, space, sigma, whole, subrays=SUBRAYS, exact=True, priors=task.priors)
+    values = solution.space.with_shear(solution.values, shear=shear)
+    found = minimise(
+        model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE, stamp_error=solution.stamp_error
+    )  # fmt: skip
+    if found.cost <= _HOPELESS * task.acceptance.chi2_per_dof * model.pixels:
+        return _again(found, model)
+    return found
+
+
+def _again(solution: Solution, model: ImageModel) -> Solution:
+    """The minimum of a model with derivatives of integrated light, from where another one was."""
+    return minimise(
+        model, solution.start, solution.values, INTEGRATED_STEPS, TOLERANCE, integrated=True,
+        stamp_error=solution.stamp_error,
+    )  # fmt: skip
+
+
+def _variances(task: Task, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Variance (ny, nx) allowed for the light of the AGN images as they were fitted, and for extended light."""
+    optics, space = task.observation.optics, solution.space
+    amplitudes, _, columns = solution.model.amplitudes(solution.values)
+    extended = slice(space.n_agn, -1)
+    light = solution.model.unwhitened(columns[:, extended], amplitudes[extended])
+    return optics.agn_variance(agn_light(task.observation, solution.agn())), optics.extended_variance(light)
+
+
+def _sigma(task: Task, solution: Solution) -> FloatArray:
+    """Standard deviation of the pixels of the final fit, the PSF's errors included; infinite where not fitted."""
+    stamps, extended = _variances(task, solution)
+    sigma = weights_sigma(task.observation, solution.stamp_error**2 * stamps + extended)
+    sigma[~_fitted(task, solution.lens, solution.agn())] = np.inf
+    return sigma
+
+
+def _fitted(task: Task, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray[np.bool_]:
+    """Pixels (ny, nx) of the final fit: a circle.
+
+    Nobody knows what shines into the image's border; and where the stamp of an AGN image ends, its light does not.
+    """
+    scale, (ny, nx) = task.observation.pixel_scale, task.observation.shape
+    x, y = pixel_centres(nx, scale), pixel_centres(ny, scale)
+    radius = min(0.5 * min(ny, nx) * scale - _BORDER * scale, max(_LEAST_RADIUS, _RADII * lens.theta_E))
+    if agn:
+        reach = max(math.hypot(found.x - lens.x, found.y - lens.y) for found in agn)
+        radius = min(radius, max(task.observation.optics.star_radius - reach, _FEWEST_RADII * lens.theta_E))
+    return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
+
+
+def _stamp_error(task: Task, solution: Solution) -> float | None:
+    """Error of the light of AGN images in units of what is allowed for, as the residuals of a full fit have it.
+
+    None where there are none, or the residuals do not tell.
+    """
+    if not solution.space.n_agn:
+        return None
+    observation, model = task.observation, solution.model
+    _, rest, _ = model.amplitudes(solution.values)
+    counted = np.isfinite(model.sigma)
+    residual = rest.reshape(observation.shape) * np.where(counted, model.sigma, 0.0)
+    stamps, extended = _variances(task, solution)
+    noise = weights_sigma(observation)
+    scale = noise_scale(observation, residual, model.sigma, solution.lens)
+    scaled = noise if scale is None else scale * noise
+    others = np.where(counted, scaled**2 + extended, np.inf)
+    return measured_stamp_error(residual, stamps, others, observation.optics.error_range)
+
+
+def _shear_shows(solution: Solution) -> bool:
+    """Whether a fit's shear differs from none by more than its covariance lets expect."""
+    jacobian, _ = solution.model.full_jacobian(solution.values)
+    covariance = parameter_covariance(solution.model, jacobian)
+    stop = solution.space.lens_slice.stop
+    where = slice(stop - 2, stop)
+    shear = solution.values[where]
+    return bool(shear @ np.linalg.solve(covariance[where, where], shear) > _SHEAR_SHOWS)

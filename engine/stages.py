@@ -1,0 +1,36 @@
+"""The stages of a run, told as they begin and timed as they end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from engine.result import StageTime
+
+Progress = Callable[[str, float], None]
+"""Called with a stage of :data:`STAGES` and the part of it that is done."""
+STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
+"""In their order; where no estimator needs a chain the run ends with ``parametric``."""
+
+
+@dataclass
+class Stopwatch:
+    """Wall and CPU time of each stage, told to ``progress`` as they begin."""
+
+    progress: Progress | None = None
+    stages: list[StageTime] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what is done within."""
+        self.tell(name, 0.0)
+        wall, cpu = time.perf_counter(), time.process_time()
+        yield
+        self.stages.append(StageTime(name, time.perf_counter() - wall, time.process_time() - cpu))
+
+    def tell(self, name: str, done: float) -> None:
+        """Say how far a stage is."""
+        if self.progress is not None:
+            self.progress(name, done)
