@@ -94,7 +94,8 @@ def write(connection: Connection, rows: Rows) -> None:
                 column.name: row[column.name] if column.name in row else _made_up(connection, column)
                 for column in table.columns
                 if column.autoincrement is not True
-                and (column.name in row or not (column.nullable or column.server_default is not None))
+                # What is null is left out: a reflected JSON column would make a JSON null of it.
+                and (row.get(column.name) is not None or not (column.nullable or column.server_default is not None))
             }
             connection.execute(table.insert(), values)
 
