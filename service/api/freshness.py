@@ -20,7 +20,8 @@ NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The clien
 def weak_tag(request: Request, *state: Any) -> str:
     """The ETag of an answer that is made of ``state``: weak, since what follows from the clock may differ."""
     # Whatever else the answer depends on: what was asked, and the code that answers.
-    said = json.dumps([VERSION, request.scope["path"], sorted(request.query_params.multi_items()), *state], default=str)
+    asked = sorted(item for item in request.query_params.multi_items() if item[0] != "wait")
+    said = json.dumps([VERSION, request.scope["path"], asked, *state], default=str)
     return f'W/"{hashlib.sha256(said.encode()).hexdigest()[:32]}"'
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from service.domain.views import GridView, Links, RunView, SystemItem
+from service.domain.views import GridItem, GridView, Links, RunItem, RunView, SystemItem
 
 _ACTIONS = ("cancel", "pause", "resume", "retry")
+_PARTS = ("figure",)
+"""What a run has addresses for where there is it."""
 _SystemT = TypeVar("_SystemT", bound=SystemItem)
 
 
@@ -26,6 +28,25 @@ def link_grids(grids: Sequence[GridView]) -> list[GridView]:
 def link_runs(runs: Sequence[RunView]) -> list[RunView]:
     """Each with its own address and that of its grid."""
     return [run.model_copy(update={"links": _run_links(run.id, run.grid_id)}) for run in runs]
+
+
+def compact_grids(grids: Sequence[GridView]) -> list[GridItem]:
+    """Each in short."""
+    names = [name for name in GridItem.model_fields if name != "links"]
+    return [GridItem(**{name: getattr(one, name) for name in names}, links=link_grid(one).links) for one in grids]
+
+
+def link_run_items(runs: Sequence[RunItem]) -> list[RunItem]:
+    """Each with the addresses of what there is of it: the store says by a key in its place."""
+    return [
+        run.model_copy(
+            update={
+                "links": {"self": f"/v1/runs/{run.id}"}
+                | {part: f"/v1/runs/{run.id}/{part}" for part in _PARTS if part in run.links}
+            }
+        )
+        for run in runs
+    ]
 
 
 def link_document(document: dict[str, Any]) -> dict[str, Any]:

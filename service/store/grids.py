@@ -26,7 +26,7 @@ from sqlalchemy.exc import IntegrityError
 from service.domain.identifiers import utc_now
 from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
-from service.domain.views import GridPage, GridView, RunDetail, RunPage
+from service.domain.views import CompactRunPage, GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
 from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
@@ -39,6 +39,7 @@ from service.store.rows import (
     ended_grid_view,
     grid_view,
     run_document,
+    run_item,
     run_view,
 )
 from service.store.settling import IS_OPEN, settle
@@ -67,6 +68,17 @@ _COUNTS = (
     .group_by(run.c.grid_id, run.c.state)
 )
 _RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
+_RUN_VERSION = (
+    select(
+        *(run.c[name] for name in ("state", "attempt", "suspect", "finished_at", "error_code", "error_detail")),
+        # They may be pruned.
+        select(func.count()).where(attempt.c.run_id == run.c.id).correlate(run).scalar_subquery(),
+        *(result.c[name] for name in ("payload_digest", "stored_at", "figure", "products")),
+    )
+    .join(grid, grid.c.id == run.c.grid_id)
+    .outerjoin(result, result.c.run_id == run.c.id)
+    .where(run.c.id == bindparam("wanted"), WHOLE)
+)
 _RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
 _ESTIMATES = select(*ESTIMATE_COLUMNS).where(estimate.c.run_id == bindparam("wanted"))
 _ATTEMPTS = select(*ATTEMPT_COLUMNS).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
@@ -165,9 +177,13 @@ class GridStore:
         with self._database.read() as connection:
             return summarise(connection, self._grid(connection, grid_id), limit, offset)
 
-    def grids(self, limit: int, before: str | None = None) -> GridPage:
-        """A page of grids, newest first, all from one picture of the database; ``next`` holds the cursor."""
-        wanted = select(grid).where(WHOLE).order_by(grid.c.id.desc()).limit(limit + 1)
+    def grids(self, limit: int, before: str | None = None, *, with_requests: bool = True) -> GridPage:
+        """A page of grids, newest first, all from one picture of the database; ``next`` holds the cursor.
+
+        Without their requests, which may have a megabyte each, that of every grid is empty.
+        """
+        columns = [column for column in grid.c if with_requests or column is not grid.c.request]
+        wanted = select(*columns).where(WHOLE).order_by(grid.c.id.desc()).limit(limit + 1)
         if before is not None:
             wanted = wanted.where(grid.c.id < before)
         with self._database.read() as connection:
@@ -185,6 +201,27 @@ class GridStore:
             rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
         items = [run_view(row) for row in rows[:limit]]
         return RunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
+
+    def run_items(self, grid_id: str, limit: int, after: int = -1, state: RunState | None = None) -> CompactRunPage:
+        """A page of a grid's runs in short; ``links`` of each has the keys of its artefacts."""
+        columns = (run.c.id, run.c.ordinal, run.c.label, run.c.state, run.c.error_code, run.c.finished_at)
+        wanted = select(*columns, result.c.figure, result.c.products).outerjoin(result, result.c.run_id == run.c.id)
+        wanted = wanted.where(run.c.grid_id == grid_id, run.c.ordinal > after)
+        if state is not None:
+            wanted = wanted.where(run.c.state == state)
+        with self._database.read() as connection:
+            self._require(connection, grid_id)
+            rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
+        items = [run_item(row) for row in rows[:limit]]
+        return CompactRunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
+
+    def run_version(self, wanted: str) -> tuple[Any, ...]:
+        """What changes whenever a run's document does, without reading that."""
+        with self._database.read() as connection:
+            row = connection.execute(_RUN_VERSION, {"wanted": wanted}).one_or_none()
+        if row is None:
+            raise NotFoundError(f"there is no run {wanted}")
+        return tuple(row)
 
     def run(self, wanted: str) -> RunDetail:
         """One run with result and attempts, checked."""
@@ -318,7 +355,9 @@ class GridStore:
         latest = recent(connection, ids) if ids else {}
         workers = _workers(connection) if len(latest) < len(ids) else 0
         return [
-            grid_view(row, counts[row.id], latest.get(row.id), now, workers) if row.ending is None else ended_grid_view(row)
+            grid_view(row, counts[row.id], latest.get(row.id), now, workers)
+            if row.ending is None
+            else ended_grid_view(row)
             for row in rows
         ]
 

@@ -10,7 +10,7 @@ from sqlalchemy import Row, RowMapping
 
 from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload, estimator_and_prior
 from service.domain.states import GridState, RunState
-from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunView
+from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunItem, RunView
 from service.store.pace import Recent
 from service.store.tables import attempt, estimate, run
 
@@ -49,7 +49,7 @@ def grid_view(
 ) -> GridView:
     """A grid with its progress; an unfinished one that is not paused is running once a run has been started.
 
-    ``workers`` that there are now: before the first run has ended the time left is reckoned by what runs of its kind took.
+    ``workers`` that there are now: before the first run has ended the time left is that of stored runs of its kind.
     """
     runs = RunCounts(**counts)
     state = GridState(row.state)
@@ -83,7 +83,7 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         paused_at=row.paused_at,
         engine_digest=row.engine_digest,
         owner=row.owner,
-        request=row.request,
+        request=row._mapping.get("request", {}),
         links={},
     )
 
@@ -102,6 +102,14 @@ def _pace(recent: Recent | None, remaining: int, now: datetime) -> tuple[float |
         rate = recent.rate(now)
         left = remaining / rate
     return rate, max(left, 0.0) if remaining else 0.0
+
+
+def run_item(row: Row[*tuple[Any, ...]]) -> RunItem:
+    """A run in short, with the keys of its artefacts in the place of their addresses."""
+    artefacts = {name: getattr(row, name) for name in ("figure", "products")}
+    names = [name for name in RunItem.model_fields if name != "links"]
+    kept = {name: key for name, key in artefacts.items() if key is not None}
+    return RunItem(**{name: getattr(row, name) for name in names}, links=kept)
 
 
 def run_view(row: Row[Any]) -> RunView:
