@@ -10,7 +10,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
 
 from service import VERSION
-from service.api import catalogue, downloads, events, grids, health, login, problems, results
+from service.api import catalogue, downloads, events, grids, health, login, measurements, problems, results
 from service.api.context import Context, bind_ids
 from service.api.gate import COOKIE, Gate
 from service.api.limits import BodyLimit, known_parameters
@@ -85,7 +85,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     app.state.context = context
-    app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes)
+    app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes, streamed=frozenset({measurements.ADDRESS}))
     # Before the body is read: who may not come in sends none.
     app.add_middleware(Gate, tokens=context.tokens if context.settings.asks_for_tokens else None)
     app.add_middleware(Head)
@@ -94,6 +94,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app)
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
-    for room in (grids, results, events, catalogue, health, login):
+    for room in (grids, results, measurements, events, catalogue, health, login):
         app.include_router(room.router)
     return app

@@ -16,6 +16,7 @@ from service.store.costs import CostStore
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
+from service.store.measurements import MeasurementStore
 from service.store.outbox import EventStore
 from service.store.tokens import TokenStore
 
@@ -31,6 +32,7 @@ class Context:
         self.grids = GridStore(self.database)
         self.costs = CostStore(self.database)
         self.events = EventStore(self.database)
+        self.measurements = MeasurementStore(self.database)
         self.tokens = TokenStore(self.database)
         self.hub = Hub(self.events, settings.max_streams)
         # A connection of their own each time, or probes would queue behind whoever waits for the database already.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from service.domain.views import GridItem, GridView, Links, RunItem, RunView, SystemItem
+from service.domain.views import GridItem, GridView, Links, MeasurementView, RunItem, RunView, SystemItem
 
 _ACTIONS = ("cancel", "pause", "resume", "retry")
 _PARTS = ("figure",)
@@ -60,6 +60,16 @@ def link_document(document: dict[str, Any]) -> dict[str, Any]:
 
 def _run_links(run_id: str, grid_id: str) -> Links:
     return {"self": f"/v1/runs/{run_id}", "grid": f"/v1/grids/{grid_id}"}
+
+
+def link_measurement(found: MeasurementView) -> MeasurementView:
+    """A measurement with its addresses, those of its grid and run, and of its figure where the store names one."""
+    own, grid = f"/v1/measurements/{found.id}", f"/v1/grids/{found.id}"
+    links = {"self": own, "grid": grid, "run": f"/v1/runs/{found.run_id}"}
+    links |= {name: f"{grid}/{name}" for name in ("events", *_ACTIONS)}
+    if "figure" in found.links:
+        links["figure"] = f"{own}/figure"
+    return found.model_copy(update={"links": links})
 
 
 def link_system(system: _SystemT) -> _SystemT:

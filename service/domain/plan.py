@@ -6,6 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+IMAGE = "image"
+"""Kind of a run that measures an uploaded image."""
+
 
 class Kind(NamedTuple):
     """What the time that a run takes depends on most."""

@@ -343,6 +343,33 @@ class RunDetail(RunView):
     attempts: list[AttemptView]
 
 
+class MeasurementView(_Answer):
+    """An uploaded image, and what was found in it; the id is that of a grid of one run."""
+
+    id: str
+    run_id: str
+    name: str | None
+    owner: str | None
+    state: RunState
+    uws_phase: UwsPhase
+    error: RunError | None
+    created_at: datetime
+    finished_at: datetime | None
+    uploads: dict[str, str]
+    """Keys of the files in the artefact store."""
+    options: dict[str, Any]
+    measurement: dict[str, Any] | None
+    """The JSON that ``hostlens measure`` writes; null in lists, before the end, and once it was pruned."""
+    links: Links
+
+
+class MeasurementPage(_Answer):
+    """A page of measurements, newest first."""
+
+    items: list[MeasurementView]
+    next: str | None
+
+
 class SummaryValue(_Answer):
     """One quantity over the runs of one input.
 

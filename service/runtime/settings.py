@@ -79,6 +79,8 @@ class Settings(LogSettings):
     """Whether the API asks for tokens; where None, unless it listens on loopback. ``off`` elsewhere is for a proxy or a
     firewall that asks who comes; ``tokens`` on loopback for a proxy that does not."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 1_000_000
+    max_upload_bytes: Annotated[int, Field(ge=10_000, le=2**33)] = 64_000_000
+    """Of the files of a measurement together."""
     max_grid_runs: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
     api_processes: Annotated[int, Field(ge=1, le=64)] = 2
     """API processes that ``hostlens serve`` starts on the one port; the three limits below hold in each."""

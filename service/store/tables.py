@@ -288,6 +288,24 @@ result = Table(
 )
 
 
+# What was found in uploaded images: until it is pruned.
+measurement = Table(
+    "measurement",
+    metadata,
+    Column("run_id", ForeignKey("run.id"), primary_key=True),
+    Column("stored_at", UtcDateTime, nullable=False),
+    Column("document", JSON, nullable=False),
+    Column("payload_digest", String(64), nullable=False),
+    Column("engine_digest", String(64), nullable=False),
+    Column("wall_s", Float, nullable=False),
+    Column("cpu_s", Float, nullable=False),
+    Column("figure", String(200)),
+    Column("figure_digest", String(64)),
+)
+# The runs that measure images, in the order of their grids: few among many.
+Index("ix_run_image", run.c.grid_id, sqlite_where=text("kind = 'image'"), postgresql_where=text("kind = 'image'"))
+
+
 def _quantity_columns() -> list[Column[Any]]:
     # All null where results are older than a quantity; the bias also where there is no truth.
     return [Column(f"{quantity}_{part}", Float) for quantity in QUANTITIES for part in ("mean", "sd", "bias")]

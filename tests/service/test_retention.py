@@ -94,6 +94,7 @@ def test_what_has_ended_long_ago_goes_and_what_stays_is_told_with_its_reason(ser
         Share("events", 10, {NEWEST: 2, YOUNGER: 6, OPEN: 1}),
         Share("attempts", 4, {YOUNGER: 2}),
         Share("idempotency keys", 2, {YOUNGER: 1, OPEN: 1}),
+        Share("measurements", 0, {}),
     ]
     before = rows(service.database)
     shown = {grid_id: service.grids.grid(grid_id) for grid_id in (*old, young, opened)}
