@@ -211,7 +211,10 @@ def test_what_is_no_fits_file_or_does_not_fit_together_is_refused_at_the_door(
     assert_problem(api.post(ADDRESS, json={"image": "x"}), 415)
     assert_problem(api.post(ADDRESS, content=b"x", headers={"Content-Type": "multipart/form-data"}), 400)
     broken = {"Content-Type": "multipart/form-data; boundary=x"}
-    assert_problem(api.post(ADDRESS, content=b"--x\r\nnothing", headers=broken), 400)
+    # A part that does not come to its end is none.
+    half = b'--x\r\nContent-Disposition: form-data; name="image"; filename="x"\r\n\r\n' + files["image"]
+    assert_problem(api.post(ADDRESS, content=half, headers=broken), 422, "/image")
+    assert_problem(api.post(ADDRESS, content=b"nothing", headers=broken), 400)
     assert_problem(api.post(ADDRESS, files={"image": ("x", bytes(31_000_000))}), 413)
     # Nothing of it has been kept.
     assert not (settings.data_dir / "artefacts").exists()
