@@ -34,6 +34,9 @@ _CURVATURE = 0.05
 _DEPTH = 12
 """Halvings of a cell beside a critical curve: 1e-5 theta_E."""
 _NEWTON_STEPS = 60
+_ROOT = 1e-12
+"""What may be left of the lens equation [arcsec] at an image: some thousand roundings."""
+_MOST_IMAGES = 16
 _MOST_CELLS = 20_000
 
 
@@ -55,7 +58,7 @@ def _determinant(x: float, y: float, lens: LensConstants) -> float:
 
 @kernel
 def _polish(x: float, y: float, sx: float, sy: float, lens: LensConstants) -> tuple[float, float, bool]:
-    """Damped Newton from (x, y) to an image of the source (sx, sy) [arcsec]; whether it converged to rounding."""
+    """Damped Newton on the lens equation; whether it converged to rounding."""
     ax, ay = deflect_point(x, y, lens)
     fx, fy = x - ax - sx, y - ay - sy
     error = math.hypot(fx, fy)
@@ -84,7 +87,7 @@ def _polish(x: float, y: float, sx: float, sy: float, lens: LensConstants) -> tu
             damping *= 0.5
         if not improved:
             break
-    return x, y, error < 1e-12
+    return x, y, error < _ROOT
 
 
 @inlined_kernel
@@ -135,14 +138,14 @@ def _map_cell(x: float, y: float, side: float, sx: float, sy: float, lens: LensC
 
 @kernel
 def _candidates(sx: float, sy: float, half: float, theta_E: float, lens: LensConstants, found: FloatArray) -> int:
-    """Cells that may hold images: centre and side [arcsec], written into ``found`` (n, 3); how many there are."""
+    """Centres and sides of the cells that may hold images, written into ``found`` (n, 3); how many, if room."""
     stack = np.empty((512, 4))
     # Off the lens by an irrational part, so that no corner and no centre ever falls on it.
     stack[0, 0], stack[0, 1] = lens.x + 0.0318309886 * half, lens.y + 0.0271828183 * half
     stack[0, 2], stack[0, 3] = 2.1 * half, 0.0
     top = 1
     n = 0
-    while top > 0:
+    while top > 0 and n <= found.shape[0]:
         top -= 1
         x, y, side, depth = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
         cut = _is_coarse(x, y, side, theta_E, lens)
@@ -165,11 +168,45 @@ def _candidates(sx: float, sy: float, half: float, theta_E: float, lens: LensCon
     return n
 
 
+@inlined_kernel
+def _left_beside(x: float, y: float, sx: float, sy: float, lens: LensConstants) -> float:
+    """What is left of the lens equation after a step along the axis in which the image plane is squeezed least."""
+    ax, ay = deflect_point(x, y, lens)
+    fx, fy = x - ax - sx, y - ay - sy
+    kappa, g1, g2 = jacobian_point(x, y, lens)
+    turn = 0.5 * math.atan2(g2, g1)
+    ex, ey, stretch = -math.sin(turn), math.cos(turn), 1.0 - kappa + math.hypot(g1, g2)
+    if kappa > 1.0:
+        ex, ey, stretch = ey, -ex, 1.0 - kappa - math.hypot(g1, g2)
+    step = (fx * ex + fy * ey) / stretch
+    x, y = x - step * ex, y - step * ey
+    ax, ay = deflect_point(x, y, lens)
+    return math.hypot(x - ax - sx, y - ay - sy)
+
+
+@kernel
+def _same_image(
+    x: float, y: float, u: float, v: float, sx: float, sy: float, theta_E: float, lens: LensConstants
+) -> bool:
+    """Whether all between two roots solves the lens equation too, as far as a root is known.
+
+    On a fold Newton stops anywhere within the square root of rounding of the double root, on a cusp within its cube
+    root of the triple one: no distance tells roots found twice from pairs, what lies between them does. That is a
+    curve, so that a step leads there from the straight line.
+    """
+    if math.hypot(x - u, y - v) > 0.01 * theta_E:
+        return False
+    for k in range(1, 4):
+        if _left_beside(x + 0.25 * k * (u - x), y + 0.25 * k * (v - y), sx, sy, lens) > 2.0 * _ROOT:
+            return False
+    return True
+
+
 @kernel
 def _images(
     candidates: FloatArray, sx: float, sy: float, theta_E: float, lens: LensConstants, roots: FloatArray
 ) -> int:
-    """Distinct images [arcsec] reached from the candidate cells, written into ``roots`` (n, 2); how many."""
+    """Distinct images reached from the candidate cells, written into ``roots`` (n, 2); how many, if room."""
     n = 0
     for c in range(candidates.shape[0]):
         for k in range(5):
@@ -180,14 +217,11 @@ def _images(
             if not converged:
                 continue
             known = False
-            determinant = _determinant(x, y, lens)
             for m in range(n):
-                distance = math.hypot(x - roots[m, 0], y - roots[m, 1])
-                other = _determinant(roots[m, 0], roots[m, 1], lens)
-                # On a caustic Newton stops anywhere within the square root of rounding of a double root.
-                blurred = distance < 1e-5 * theta_E and determinant * other > 0.0 and abs(determinant) < 1e-4
-                known = known or blurred or distance < 1e-7 * theta_E
-            if not known and n < roots.shape[0]:
+                known = known or _same_image(x, y, roots[m, 0], roots[m, 1], sx, sy, theta_E, lens)
+            if not known:
+                if n == roots.shape[0]:
+                    return n + 1
                 roots[n, 0], roots[n, 1] = x, y
                 n += 1
     return n
@@ -197,6 +231,9 @@ def solve_lens_equation(
     lens: PowerLawLens, source_x: float, source_y: float, *, min_magnification: float = 1e-2
 ) -> tuple[LensedImage, ...]:
     """All images of a point source, brightest first.
+
+    On a caustic, to within 1e-12 arcsec, the two images of a fold or the three of a cusp are one, whose magnification
+    and parity rounding decides.
 
     Parameters
     ----------
@@ -210,7 +247,8 @@ def solve_lens_equation(
     Raises
     ------
     LensEquationError
-        No image was found; a source always has one at least.
+        No image was found; a source always has one at least. Or they cannot be told apart: a point behind the
+        middle of a round lens, say, whose image is a ring.
     """
     constants = lens_constants(lens)
     offset = math.hypot(source_x - lens.x, source_y - lens.y)
@@ -225,13 +263,13 @@ def solve_lens_equation(
         if half > 1e4 * reach + 10.0 * offset:
             raise LensEquationError(f"slope {lens.slope} and shear {shear} leave the image plane unbounded")
     cells = np.empty((_MOST_CELLS, 3))
+    roots = np.empty((_MOST_IMAGES, 2))
     n = _candidates(source_x, source_y, half, lens.theta_E, constants, cells)
-    if n > _MOST_CELLS:
+    found = 0 if n > _MOST_CELLS else _images(cells[:n], source_x, source_y, lens.theta_E, constants, roots)
+    if n > _MOST_CELLS or found > _MOST_IMAGES:
         raise LensEquationError(f"the source at ({source_x}, {source_y}) behind {lens} is too close to a caustic")
-    found = np.empty((16, 2))
-    roots = found[: _images(cells[:n], source_x, source_y, lens.theta_E, constants, found)]
     images = []
-    for x, y in roots:
+    for x, y in roots[:found]:
         mu = float(magnification(lens, np.array(x), np.array(y)))
         if abs(mu) >= min_magnification:
             images.append(LensedImage(x, y, mu))

@@ -10,7 +10,19 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
 
 from service import VERSION
-from service.api import catalogue, downloads, events, grids, health, login, measurements, problems, results
+from service.api import (
+    catalogue,
+    downloads,
+    events,
+    exports,
+    grids,
+    health,
+    login,
+    measurements,
+    problems,
+    results,
+    run_files,
+)
 from service.api.context import Context, bind_ids
 from service.api.gate import COOKIE, Gate
 from service.api.limits import BodyLimit, known_parameters
@@ -94,6 +106,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app)
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
-    for room in (grids, results, measurements, events, catalogue, health, login):
+    for room in (grids, run_files, results, exports, measurements, events, catalogue, health, login):
         app.include_router(room.router)
     return app

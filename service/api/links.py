@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from service.domain.views import GridItem, GridView, Links, MeasurementView, RunItem, RunView, SystemItem
 
 _ACTIONS = ("cancel", "pause", "resume", "retry")
-_PARTS = ("figure",)
+_PARTS = ("figure", "products")
 """What a run has addresses for where there is it."""
 _SystemT = TypeVar("_SystemT", bound=SystemItem)
 
@@ -50,11 +50,14 @@ def link_run_items(runs: Sequence[RunItem]) -> list[RunItem]:
 
 
 def link_document(document: dict[str, Any]) -> dict[str, Any]:
-    """A run as plain data, with these addresses and, where it has one, that of its figure."""
+    """A run as plain data, with these addresses and those of the files that it has."""
     links = _run_links(document["id"], document["grid_id"])
-    result = document["result"]
-    if result is not None and result["figure"] is not None:
-        links["figure"] = f"{links['self']}/figure"
+    result, own = document["result"], links["self"]
+    if result is not None:
+        links["record"] = f"{own}/record"
+        links |= {"figure": f"{own}/figure"} if result["figure"] is not None else {}
+        links |= {"products": f"{own}/products", "fits": f"{own}/fits"} if result["products"] is not None else {}
+        links |= {"chain": f"{own}/chain.nc"} if result["products"] is not None and result["chain"] else {}
     return document | {"links": links}
 
 

@@ -83,11 +83,16 @@ class ComparisonQuery(AnswerQuery):
     right: _Text
 
 
-class ResultQuery(FilterBody):
-    """What /v1/results is asked."""
+class RowsQuery(FilterBody):
+    """Which results, with the answers of which estimator."""
 
     estimator: Literal[(*_ESTIMATORS, "all")] = _RECOMMENDED[0]  # type: ignore[valid-type]
     index_prior: Literal[_PRIORS] = _RECOMMENDED[1]  # type: ignore[valid-type]
+
+
+class ResultQuery(RowsQuery):
+    """What /v1/results is asked."""
+
     limit: int = Field(default=100, ge=1, le=1000)
     cursor: str | None = Field(default=None, pattern=RUN_PATTERN, description="From Link or next")
 
@@ -185,11 +190,11 @@ def comparison(response: Response, service: Service, query: Annotated[Comparison
 @patient
 def results(request: Request, response: Response, service: Service, query: Annotated[ResultQuery, Query()]) -> Response:
     """Results as flat rows: what was put in, what one estimator (or each) recovered, and how the run went."""
-    names = _estimates(query)
+    names = wanted_estimates(query)
     columns = result_columns(names)
     keys = [column.name for column in columns]
     with service.database.read() as connection:
-        found = result_rows(connection, _filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
+        found = result_rows(connection, result_filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
         rows = [dict(zip(keys, row, strict=True)) for row in found]
     following = rows[query.limit - 1]["run_id"] if len(rows) > query.limit else None
     answer = {
@@ -204,20 +209,21 @@ def _written(answer: dict[str, Any], response: Response) -> Response:
     return Response(to_json(answer), media_type="application/json", headers=dict(response.headers))
 
 
-def _given(query: BaseModel) -> dict[str, list[str]]:
+def given_filter(query: BaseModel) -> dict[str, list[str]]:
     """Values of the filter by axis, those alone that were given."""
     return {name: getattr(query, name) for name in AXES if getattr(query, name)}
 
 
-def _filter(query: BaseModel) -> ResultFilter:
+def result_filter(query: BaseModel) -> ResultFilter:
+    """The results that a query means; an InvalidRequestError names the parameter that cannot be read."""
     try:
-        return ResultFilter.read(_given(query))
+        return ResultFilter.read(given_filter(query))
     except FilterError as error:
         raise InvalidRequestError("query", error.parameter, str(error)) from error
 
 
 def _question(query: AnswerQuery) -> Question:
-    return Question(_filter(query), query.quantity, query.estimator, query.index_prior)
+    return Question(result_filter(query), query.quantity, query.estimator, query.index_prior)
 
 
 def _axes(group_by: str) -> tuple[str, ...]:
@@ -238,7 +244,7 @@ def _asked(query: AnswerQuery, axes: tuple[str, ...]) -> dict[str, Any]:
         "index_prior": query.index_prior,
         "recommended": (query.estimator, query.index_prior) == _RECOMMENDED,
         "group_by": list(axes),
-        "filter": _given(query),
+        "filter": given_filter(query),
     }
 
 
@@ -253,7 +259,8 @@ def _side(query: ComparisonQuery, name: str) -> str | None:
     return None if value == NONE and allowed is None else value
 
 
-def _estimates(query: ResultQuery) -> tuple[EstimateName, ...]:
+def wanted_estimates(query: RowsQuery) -> tuple[EstimateName, ...]:
+    """The estimates whose answers the rows hold."""
     if query.estimator == "all":
         return ESTIMATES
     wanted = (query.estimator, query.index_prior)
@@ -262,7 +269,7 @@ def _estimates(query: ResultQuery) -> tuple[EstimateName, ...]:
 
 def _results_link(query: AnswerQuery, axes: tuple[str, ...], values: tuple[Any, ...]) -> str:
     """The results behind one group's numbers."""
-    wanted = _given(query) | {
+    wanted = given_filter(query) | {
         axis: [NONE if value is None else repr(value) if isinstance(value, float) else str(value)]
         for axis, value in zip(axes, values, strict=True)
     }

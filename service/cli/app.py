@@ -15,6 +15,7 @@ from typer.exceptions import TyperException
 from service import VERSION
 from service.cli.measuring import measure
 from service.cli.pictures import COMMANDS, named_or_read
+from service.cli.replay import replay
 from service.cli.request_file import read_request
 from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
@@ -70,7 +71,7 @@ app = typer.Typer(
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
-for command in (*COMMANDS, measure):
+for command in (*COMMANDS, measure, replay):
     app.command()(command)
 
 Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]

@@ -370,6 +370,28 @@ class MeasurementPage(_Answer):
     next: str | None
 
 
+class RunRecord(_Answer):
+    """A run that stands alone: computed again from ``spec`` with the same engine it finds the same ``found``."""
+
+    format: Literal["hostlens record 1"]
+    service: str
+    run_id: str
+    grid_id: str
+    label: str
+    paper_run: int | None
+    spec: dict[str, Any]
+    seed: int | None
+    realization_digest: str
+    engine_digest: str
+    payload_digest: str
+    """SHA-256 of what was found: two executions with one engine agree in it."""
+    versions: dict[str, str]
+    stored_at: datetime
+    warnings: list[str]
+    found: dict[str, float | int | str | None]
+    """By the names of an export's columns, of all estimators."""
+
+
 class SummaryValue(_Answer):
     """One quantity over the runs of one input.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, and_, select
+from sqlalchemy import ColumnElement, Connection, Select, and_, select
 from sqlalchemy.sql.selectable import FromClause
 
 from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, EstimateName, estimator_and_prior
@@ -37,7 +37,7 @@ _COUNT_NAMES = {
     "r_eff_at_bound": "draws whose fit ended at a bound of r_eff",
     "failed": "draws that could not be fitted",
 }
-_LENS_UNITS = {"theta_E": _ARCSEC, "phi": _DEGREE, "x": _ARCSEC, "y": _ARCSEC}
+_LENS_UNITS = {"theta_E": _ARCSEC, "phi": "rad", "x": _ARCSEC, "y": _ARCSEC}
 _PARTS = {
     "mean": "mean over the draws",
     "sd": "standard deviation over the draws",
@@ -160,7 +160,20 @@ def result_rows(
     read as they are taken, in constant memory, and all are of one picture of the database if ``connection`` is one of
     :meth:`service.store.database.Database.read`. ``after`` is the id of the run after which to begin.
     """
-    columns = result_columns(estimates) if columns is None else columns
+    wanted = result_statement(where, estimates, result_columns(estimates) if columns is None else columns)
+    if after is not None:
+        wanted = wanted.where(result.c.run_id > after)
+    if limit is not None:
+        wanted = wanted.limit(limit)
+    with connection.execution_options(yield_per=_AT_ONCE).execute(wanted) as rows:
+        for row in rows:
+            yield tuple(row)
+
+
+def result_statement(
+    where: ResultFilter, estimates: Sequence[EstimateName], columns: Sequence[ResultColumn]
+) -> Select[Any]:
+    """What reads the results that are meant, by their runs' ids: to be narrowed, or counted."""
     source: FromClause = result.join(run, run.c.id == result.c.run_id)
     for name in estimates:
         table, (estimator, prior) = _TABLES[name], estimator_and_prior(name)
@@ -170,14 +183,7 @@ def result_rows(
     inputs = where.inputs()
     if inputs is not None:
         wanted = wanted.where(result.c.input_id.in_(inputs))
-    if after is not None:
-        wanted = wanted.where(result.c.run_id > after)
-    wanted = wanted.order_by(result.c.run_id)
-    if limit is not None:
-        wanted = wanted.limit(limit)
-    with connection.execution_options(yield_per=_AT_ONCE).execute(wanted) as rows:
-        for row in rows:
-            yield tuple(row)
+    return wanted.order_by(result.c.run_id)
 
 
 def _column(column: Any, kind: type, description: str, unit: str | None) -> ResultColumn:

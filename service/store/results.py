@@ -25,9 +25,9 @@ from service.store.tables import INPUT_COLUMNS
 _CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
 _PLAIN = (
     "ln_evidence", "chi2", "degrees_of_freedom", "condition_number",
-    "arc_magnitude", "agn_contrast", "surface_brightness", "wall_s", "cpu_s", "engine_digest",
-    "noise_treatment", "regularisation", "profile",
+    "arc_magnitude", "agn_contrast", "surface_brightness",
 )  # fmt: skip
+_TOLD = ("wall_s", "cpu_s", "engine_digest", "noise_treatment", "regularisation", "profile")
 _PARTS = tuple((quantity, *(f"{quantity}_{part}" for part in ("mean", "sd", "bias"))) for quantity in QUANTITIES)
 
 
@@ -36,15 +36,8 @@ def result_row(lease: Lease, inputs: Mapping[str, Any], payload: ResultPayload, 
     row: dict[str, Any] = {"run_id": lease.run_id, "grid_id": lease.grid_id, "stored_at": now}
     row |= {name: inputs[name] for name in (*INPUT_COLUMNS, "configuration")}
     row["observation_digest"] = observation_digest(lease.spec)
-    row |= _aperture_columns(payload.aperture)
-    # Every row names every column, or those that are written together would lack what the first of them has not.
-    for name in LENS_PARAMETERS:
-        value, prefix = payload.lens.get(name), f"lens_{name.lower()}"
-        for part in ("mean", "sd", "truth"):
-            row[f"{prefix}_{part}"] = None if value is None else getattr(value, part)
-    chain = payload.chain
-    row |= {column: None if chain is None else getattr(chain, name) for name, column in _CHAIN.items()}
-    row |= {name: getattr(payload, name) for name in _PLAIN}
+    row |= found_columns(payload)
+    row |= {name: getattr(payload, name) for name in _TOLD}
     row |= {
         "stages": [stage.model_dump() for stage in payload.stages],
         "payload_digest": payload.digest,
@@ -56,6 +49,19 @@ def result_row(lease: Lease, inputs: Mapping[str, Any], payload: ResultPayload, 
         "products_digest": payload.products and payload.products.digest,
     }
     return row
+
+
+def found_columns(payload: ResultPayload) -> dict[str, Any]:
+    """Typed columns of what a run found beside its estimates: every one of them, null where there is no value."""
+    row = _aperture_columns(payload.aperture)
+    # Every row names every column, or those that are written together would lack what the first of them has not.
+    for name in LENS_PARAMETERS:
+        value, prefix = payload.lens.get(name), f"lens_{name.lower()}"
+        for part in ("mean", "sd", "truth"):
+            row[f"{prefix}_{part}"] = None if value is None else getattr(value, part)
+    chain = payload.chain
+    row |= {column: None if chain is None else getattr(chain, name) for name, column in _CHAIN.items()}
+    return row | {name: getattr(payload, name) for name in _PLAIN}
 
 
 def observation_digest(spec: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from service.domain.payload import ArtefactPayload, result_payload
 from service.runtime import logs
 from service.store.artefacts import ArtefactStore, keeping
 from service.worker.answers import LIMIT_BYTES, RUNNING, to_bytes
+from service.worker.machine import machine
 
 if TYPE_CHECKING:
     from engine import RunResult
@@ -102,7 +103,7 @@ def greet(task: str) -> bytes:
     module = import_module(task.partition(":")[0])
     engine = _engine()
     getattr(module, "warm_up", lambda: None)()
-    threads = _one_thread()
+    threads = one_thread()
     warm_s = time.perf_counter() - began
     said = {"engine": engine, "threads": threads, "warm_s": warm_s, "pid": os.getpid(), "memory": _memory()}
     return to_bytes({**said, **_join()})
@@ -121,7 +122,7 @@ def _join() -> dict[str, Any]:
     return {"memory_limit": rules.memory_limit, "pause_fraction": rules.memory_pause_fraction or None}
 
 
-def _one_thread() -> dict[str, int]:
+def one_thread() -> dict[str, int]:
     """Hold every loaded numeric library to one thread; how many each then uses."""
     from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -176,7 +177,8 @@ def execute(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
     result = run(realization_from_dict(spec))
     artefacts = ArtefactStore(artefact_url)
     figure = artefacts.put(_figure(result), "png")
-    return result_payload(result, figure, _products(result, artefacts)).model_dump(mode="json")
+    payload = result_payload(result, figure, _products(result, artefacts))
+    return payload.model_copy(update={"versions": payload.versions | machine()}).model_dump(mode="json")
 
 
 def _figure(result: RunResult) -> bytes:

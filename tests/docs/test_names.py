@@ -28,6 +28,11 @@ def _command(words: list[str]) -> tuple[Any, list[str]]:
     return command, words
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_no_merge_has_left_its_marks(page: Path) -> None:
+    assert not re.search(r"^(<{7}|={7}$|>{7})", page.read_text(), re.MULTILINE)
+
+
 @by_page
 def test_every_command_exists_with_its_options(page: Path) -> None:
     for words in commands(page):

@@ -5,8 +5,17 @@ from __future__ import annotations
 import json
 import re
 
+import pytest
 from pydantic_core import PydanticUndefined
 
+from engine.measure import POOR_FIT
+from engine.parametric.constraints import (
+    CENTRE_PRIOR,
+    ELLIPTICITY_PRIOR,
+    POSITION_ERROR,
+    SHEAR_PRIOR,
+    SLOPE_PRIOR,
+)
 from service.domain.states import TRANSITIONS, RunState
 from service.runtime.settings import Settings
 from tests.docs.openapi import FILE, document_text
@@ -36,3 +45,27 @@ def test_the_picture_of_the_states_has_every_state_and_transition() -> None:
     picture = (ROOT / "docs" / "images" / "states.svg").read_text()
     words = re.findall(r"<text[^>]*>([^<]+)</text>", picture)
     assert set(words) == set(RunState) | set(TRANSITIONS) | {"submit"}
+
+
+def test_every_operation_is_in_the_table_of_the_api() -> None:
+    text = (ROOT / "docs" / "reference" / "api.md").read_text()
+    listed = {re.sub(r"\{\w+\}", "{}", found) for found in re.findall(r"`((?:GET|POST) /[\w/{}.]+)`", text)}
+    paths = json.loads(FILE.read_text())["paths"]
+    operations = {
+        re.sub(r"\{\w+\}", "{}", f"{method.upper()} {path}") for path, methods in paths.items() for method in methods
+    }
+    assert operations <= listed, sorted(operations - listed)
+
+
+@pytest.mark.parametrize("page", ["measure-an-image", "quote-a-host"])
+def test_priors_that_decide_an_answer_are_told_as_they_are(page: str) -> None:
+    text = " ".join((ROOT / "docs" / "howto" / f"{page}.md").read_text().split())
+    for told in (
+        f"slope {SLOPE_PRIOR[0]} ± {SLOPE_PRIOR[1]}",
+        f"shear 0 ± {SHEAR_PRIOR}",
+        f"ellipticity 0 ± {ELLIPTICITY_PRIOR}",
+        f"within {CENTRE_PRIOR} arcsec (1 sigma)",
+        f"to {POSITION_ERROR} arcsec",
+        f"bove {POOR_FIT}",
+    ):
+        assert told in text, told
