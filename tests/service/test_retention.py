@@ -29,7 +29,7 @@ from service.store.orphans import DAMAGED, FOREIGN, REFERRED, YOUNG, Orphans, ol
 from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
 from service.store.retention import NEWEST, OPEN, YOUNGER, Retention, Share
-from service.store.tables import attempt, event, idempotency, result
+from service.store.tables import attempt, event, idempotency, measurement, result
 from tests.service.conftest import Clock
 from tests.service.plans import body, planned, result_of
 
@@ -72,10 +72,10 @@ def service(database: Database, clock: Clock) -> Service:
     return Service(database, clock)
 
 
-def rows(database: Database) -> tuple[int, int, int]:
+def rows(database: Database) -> tuple[int, ...]:
     with database.read() as connection:
-        counts = [connection.scalar(select(func.count()).select_from(t)) for t in (event, attempt, idempotency)]
-    return counts[0] or 0, counts[1] or 0, counts[2] or 0
+        tables = (event, attempt, idempotency, measurement)
+        return tuple(connection.scalar(select(func.count()).select_from(table)) or 0 for table in tables)
 
 
 def prune(found: Retention) -> dict[str, int]:
