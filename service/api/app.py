@@ -15,6 +15,7 @@ from service.api import (
     downloads,
     events,
     exports,
+    figures,
     grids,
     health,
     login,
@@ -22,6 +23,7 @@ from service.api import (
     problems,
     results,
     run_files,
+    site,
 )
 from service.api.context import Context, bind_ids
 from service.api.gate import COOKIE, Gate
@@ -106,6 +108,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app)
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
-    for room in (grids, run_files, results, exports, measurements, events, catalogue, health, login):
+    figures.install(app)
+    for room in (grids, run_files, figures, results, exports, measurements, events, catalogue, health, login):
         app.include_router(room.router)
+    site.install(app)
     return app

@@ -9,6 +9,7 @@ from fastapi import Depends, Path, Query, Request
 from service.api.hub import Hub
 from service.api.metrics import ApiMetrics
 from service.domain.identifiers import GRID_PATTERN, RUN_PATTERN
+from service.figures.kept import KeptFigures
 from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
@@ -20,6 +21,7 @@ from service.store.measurements import MeasurementStore
 from service.store.outbox import EventStore
 from service.store.tokens import TokenStore
 
+_KEPT_BYTES = 32 * 2**20
 _IDS = frozenset({"grid_id", "run_id"})
 
 
@@ -40,6 +42,7 @@ class Context:
         self.leadership = Leadership(self.probed, settings.leader_ttl_s)
         self.metrics = ApiMetrics(self.database, self.leadership)
         self.artefacts = ArtefactStore(settings.artefacts, patience_s=10.0)
+        self.figures = KeptFigures(_KEPT_BYTES)
 
 
 async def _context(request: Request) -> Context:

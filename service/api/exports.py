@@ -17,7 +17,7 @@ from pydantic import Field
 from starlette.types import Receive, Scope, Send
 
 from service.api.context import Service
-from service.api.results import RowsQuery, given_filter, result_filter, wanted_estimates
+from service.api.results import RowsQuery, given_filter, read_filter, wanted_estimates
 from service.api.threads import Route
 from service.domain.identifiers import GRID_PATTERN, utc_now
 from service.exports.contents import Question, pieces, survey
@@ -59,7 +59,7 @@ class _SpooledFile(StreamingResponse):
 
 def _route(suffix: str, form: Format) -> Callable[..., Any]:
     async def export(service: Service, query: Annotated[ExportQuery, Query()]) -> Response:
-        where, now = result_filter(query), utc_now()
+        where, now = read_filter(query), utc_now()
         question = Question(where, given_filter(query), wanted_estimates(query), query.specs)
         if not _places.acquire(blocking=False):
             raise HTTPException(503, f"{_AT_A_TIME} exports are being written already", headers={"Retry-After": "5"})

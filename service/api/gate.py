@@ -17,6 +17,7 @@ from service.api.problems import database_fault, forbidden, problem
 from service.api.threads import QUICK, run_in
 from service.domain.access import ANYBODY, Caller, ForbiddenError
 from service.domain.access import Scope as Allowed
+from service.store.grids import GridStore
 from service.store.tokens import TokenStore
 
 COOKIE = "hostlens_token"
@@ -131,3 +132,15 @@ async def _caller(request: Request) -> Caller:
 
 Asking = Annotated[Caller, Depends(_caller)]
 """Who asks, for a handler."""
+
+
+def require_owner(caller: Caller, grids: GridStore, grid_id: str) -> None:
+    """Let the owner of a grid pass, the administrator, and anybody where nobody is asked.
+
+    Raises
+    ------
+    ForbiddenError, service.store.grids.NotFoundError
+        It belongs to somebody else; there is none.
+    """
+    if caller is not ANYBODY:
+        caller.require_owner(grids.owner(grid_id), f"grid {grid_id}")

@@ -13,16 +13,16 @@ from pydantic_core import to_json
 
 from engine import engine_digest
 from service.api.bodies import JsonRoute
-from service.api.context import Context, GridId, Limit, RunId, Service
+from service.api.context import GridId, Limit, RunId, Service
 from service.api.downloads import artefact
 from service.api.freshness import NOT_MODIFIED, REVALIDATED, IfNoneMatch, is_known, not_modified, weak_tag
-from service.api.gate import Asking
+from service.api.gate import Asking, require_owner
 from service.api.hub import FullError
 from service.api.links import compact_grids, link_document, link_grid, link_grids, link_run_items, link_runs
 from service.api.pages import next_link
+from service.api.retries import RetryRequest
 from service.api.threads import patient
 from service.api.waiting import GridWait, await_grid
-from service.domain.access import ANYBODY, Caller
 from service.domain.identifiers import GRID_PATTERN
 from service.domain.requests import GridRequest, plan
 from service.domain.states import RunState
@@ -32,6 +32,7 @@ from service.domain.views import (
     DryRun,
     GridPage,
     GridView,
+    RetriedGrid,
     RunDetail,
     RunPage,
     Summary,
@@ -182,35 +183,34 @@ def _written(document: Any, headers: dict[str, str] | None = None) -> Response:
 @router.post("/grids/{grid_id}/cancel")
 def cancel(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Cancel a grid: queued runs at once, running ones as soon as the dispatcher sees it."""
-    _require_owner(caller, grid_id, service)
+    require_owner(caller, service.grids, grid_id)
     return link_grid(service.grids.cancel(grid_id))
 
 
 @router.post("/grids/{grid_id}/pause")
 def pause(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Pause a grid: no queued run is started any more; running ones end as they would."""
-    _require_owner(caller, grid_id, service)
+    require_owner(caller, service.grids, grid_id)
     return link_grid(service.grids.pause(grid_id))
 
 
 @router.post("/grids/{grid_id}/resume")
 def resume(grid_id: GridId, service: Service, caller: Asking) -> GridView:
     """Resume a paused grid."""
-    _require_owner(caller, grid_id, service)
+    require_owner(caller, service.grids, grid_id)
     return link_grid(service.grids.resume(grid_id))
 
 
 @router.post("/grids/{grid_id}/retry")
-def retry(grid_id: GridId, service: Service, caller: Asking) -> GridView:
-    """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts."""
-    _require_owner(caller, grid_id, service)
-    service.grids.revive(grid_id)
-    return link_grid(service.grids.grid(grid_id))
+def retry(grid_id: GridId, service: Service, caller: Asking, body: RetryRequest | None = None) -> RetriedGrid:
+    """Queue again every run that failed, was quarantined or was cancelled, with a fresh count of attempts.
 
-
-def _require_owner(caller: Caller, grid_id: str, service: Context) -> None:
-    if caller is not ANYBODY:
-        caller.require_owner(service.grids.owner(grid_id), f"grid {grid_id}")
+    Or, with a body, those of them that it picks.
+    """
+    require_owner(caller, service.grids, grid_id)
+    retried = service.grids.revive(grid_id, None if body is None else body.wanted())
+    grid = link_grid(service.grids.grid(grid_id))
+    return RetriedGrid(**dict(grid), retried=retried)
 
 
 @router.get("/runs/{run_id}", response_model=RunDetail, responses=NOT_MODIFIED)

@@ -19,7 +19,7 @@ _FORM = "application/x-www-form-urlencoded"
 _PRIVATE = {"Cache-Control": "no-store", "Content-Security-Policy": "default-src 'self'; form-action 'self'"}
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>hostlens: log in</title></head>
+<title>hostlens: log in</title><link rel="stylesheet" href="/static/style.css"></head>
 <body><main><h1>hostlens</h1>{said}
 <form method="post" action="/login"><input type="hidden" name="next" value="{next}">
 <p><label>Token <input name="token" type="password" required autocomplete="current-password"></label>

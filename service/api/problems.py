@@ -24,6 +24,7 @@ from service.store.database import AWAY
 from service.store.faults import AccessRefusedError, SchemaMismatchError, StatementTooLongError
 from service.store.grids import KeyReusedError, NotFoundError
 from service.store.submission import SubmissionLostError
+from service.web.rendering import page, wants_page
 
 MEDIA_TYPE = "application/problem+json"
 _LOG = logging.getLogger(__name__)
@@ -70,6 +71,8 @@ def problem(
         artefact=artefact,
         errors=errors or [],
     )
+    if request is not None and wants_page(request):
+        return page("problem.html", status, headers, here="", problem=body)
     document = body.model_dump(mode="json", by_alias=True, exclude_none=True)
     # In ASCII, with everything else escaped: what a client sent comes back in it, whatever it does to a terminal.
     return Response(json.dumps(document), status_code=status, headers=headers, media_type=MEDIA_TYPE)

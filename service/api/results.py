@@ -194,7 +194,7 @@ def results(request: Request, response: Response, service: Service, query: Annot
     columns = result_columns(names)
     keys = [column.name for column in columns]
     with service.database.read() as connection:
-        found = result_rows(connection, result_filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
+        found = result_rows(connection, read_filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
         rows = [dict(zip(keys, row, strict=True)) for row in found]
     following = rows[query.limit - 1]["run_id"] if len(rows) > query.limit else None
     answer = {
@@ -214,8 +214,8 @@ def given_filter(query: BaseModel) -> dict[str, list[str]]:
     return {name: getattr(query, name) for name in AXES if getattr(query, name)}
 
 
-def result_filter(query: BaseModel) -> ResultFilter:
-    """The results that a query means; an InvalidRequestError names the parameter that cannot be read."""
+def read_filter(query: BaseModel) -> ResultFilter:
+    """The results that a query means; an InvalidRequestError at the parameter that cannot be read."""
     try:
         return ResultFilter.read(given_filter(query))
     except FilterError as error:
@@ -223,7 +223,7 @@ def result_filter(query: BaseModel) -> ResultFilter:
 
 
 def _question(query: AnswerQuery) -> Question:
-    return Question(result_filter(query), query.quantity, query.estimator, query.index_prior)
+    return Question(read_filter(query), query.quantity, query.estimator, query.index_prior)
 
 
 def _axes(group_by: str) -> tuple[str, ...]:

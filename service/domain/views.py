@@ -121,6 +121,13 @@ class CompactGridPage(_Answer):
     next: str | None
 
 
+class RetriedGrid(GridView):
+    """A grid some of whose runs have been queued again."""
+
+    retried: int
+    """How many; in a grid that is paused they wait with the others."""
+
+
 class GridPage(_Answer):
     """A page of grids, newest first."""
 

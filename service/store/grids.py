@@ -31,7 +31,7 @@ from service.store.database import Database
 from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent, recent_of
-from service.store.pieces import Turns
+from service.store.pieces import PIECE, Turns
 from service.store.rows import (
     ATTEMPT_COLUMNS,
     ESTIMATE_COLUMNS,
@@ -42,13 +42,15 @@ from service.store.rows import (
     run_item,
     run_view,
 )
-from service.store.settling import IS_OPEN, settle
+from service.store.run_filter import RunFilter
+from service.store.settling import IS_OPEN, revive_runs, settle
 from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
 from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""
+_REOPENED = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
 _BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
 
 
@@ -289,12 +291,15 @@ class GridStore:
 
         return self._marked(grid_id, mark)
 
-    def revive(self, grid_id: str) -> int:
-        """Queue again every run of a grid that ended without a result; how many.
+    def revive(self, grid_id: str, wanted: RunFilter | None = None) -> int:
+        """Queue again the runs of a grid that ended without a result, all or those that are ``wanted``; how many.
 
         Earlier attempts stay on record but are no longer counted against the run. In a paused grid they wait with the
-        others.
+        others. Should this process die halfway through some that are wanted, the rest stays as it is until somebody
+        asks for the same again.
         """
+        if wanted is not None:
+            return self._revive_some(grid_id, wanted)
         now = self._clock()
         runs = 0
 
@@ -302,12 +307,31 @@ class GridStore:
             nonlocal runs
             runs = _count(connection, grid_id, REVIVE.sources)
             if runs:
-                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
-                connection.execute(update(grid).where(grid.c.id == grid_id).values(revive_from=0, **values))
+                connection.execute(update(grid).where(grid.c.id == grid_id).values(revive_from=0, **_REOPENED))
                 add_event(connection, grid_id, "grid_revived", now, runs=runs)
 
         self._marked(grid_id, mark)
         return runs
+
+    def _revive_some(self, grid_id: str, wanted: RunFilter) -> int:
+        with self._database.read() as connection:
+            self._require(connection, grid_id)
+            found = wanted.runs(connection, grid_id, REVIVE.sources)
+        revived = 0
+        for first in range(0, len(found), PIECE):
+            ids, now = found[first : first + PIECE], self._clock()
+
+            def mark(connection: Connection, ids: Sequence[str] = ids, now: datetime = now) -> None:
+                nonlocal revived
+                # Those that have ended without a result still: somebody else may have been faster.
+                runs = len(revive_runs(connection, run.c.id.in_(ids), now))
+                if runs:
+                    connection.execute(update(grid).where(grid.c.id == grid_id).values(**_REOPENED))
+                    add_event(connection, grid_id, "grid_revived", now, runs=runs)
+                revived += runs
+
+            self._marked(grid_id, mark)
+        return revived
 
     def _marked(self, grid_id: str, mark: Callable[[Connection], None]) -> GridView:
         """Set a mark and bring the runs to where it wants them, the first of them in the same transaction.

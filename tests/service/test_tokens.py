@@ -152,6 +152,8 @@ def test_a_grid_is_stopped_by_its_owner_and_by_an_administrator_alone(api: TestC
         answer = api.post(grid["links"][action], headers=bob)
         assert_problem(answer, 403)
         assert "ada" in answer.json()["detail"]
+        if action != "retry":
+            assert_problem(api.post(f"/grids/{grid['id']}/{action}", headers=bob), 403)
     assert api.get(grid["links"]["self"], headers=bob).json()["state"] == "queued"
     assert api.post(grid["links"]["pause"], headers=ada).json()["state"] == "paused"
     # Another token of the same name is the same person's.
@@ -179,6 +181,8 @@ def test_a_browser_is_sent_to_log_in_and_back(api: TestClient, store: TokenStore
     html = {"Accept": "text/html,*/*"}
     answer = api.get("/v1/grids?limit=2", headers=html)
     assert (answer.status_code, answer.headers["location"]) == (303, "/login?next=/v1/grids%3Flimit%3D2")
+    assert api.get("/", headers=html).headers["location"] == "/login?next=/"
+    assert api.get("/static/style.css").status_code == 200
     page = api.get(answer.headers["location"], headers=html)
     assert page.status_code == 200
     assert 'value="/v1/grids?limit=2"' in page.text
