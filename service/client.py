@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["AnswerError", "ApiError", "Client", "ClientError", "Filter", "RequestError"]
+_TOO_MANY = 429
+_LONGEST_WAIT_S = 30.0
 _PAGE = 1000
 
 T = TypeVar("T", bound=BaseModel)
@@ -106,9 +108,10 @@ class Client:
             DryRun, "POST", "/v1/grids", params={"dry_run": "true"}, content=content, headers=headers
         )
 
-    def status(self, grid_id: str) -> GridView:
-        """How far a grid is."""
-        return self._connection.call(GridView, "GET", f"/v1/grids/{_part(grid_id)}")
+    def status(self, grid_id: str, wait_s: float = 0.0) -> GridView:
+        """How far a grid is; waits up to ``wait_s`` (30 at most) for its end."""
+        params = {"wait": wait_s} if wait_s else None
+        return self._connection.call(GridView, "GET", f"/v1/grids/{_part(grid_id)}", params=params)
 
     def grids(self, limit: int = 20) -> GridPage:
         """The newest grids."""
@@ -136,8 +139,16 @@ class Client:
         return [self._ended(grid_id, seen, every_s, until) for grid_id in grid_ids]
 
     def _ended(self, grid_id: str, seen: Callable[[GridView], None], every_s: float, until: float | None) -> GridView:
+        wait_s = 0.0
         while True:
-            grid = self.status(grid_id)
+            try:
+                grid = self.status(grid_id, wait_s)
+            except ApiError as error:
+                if not wait_s or error.status != _TOO_MANY:
+                    raise
+                # As many as may are waiting: this one looks again by itself.
+                time.sleep(every_s)
+                grid = self.status(grid_id)
             seen(grid)
             if grid.finished_at is not None:
                 return grid
@@ -145,7 +156,7 @@ class Client:
                 raise TimeoutError(
                     f"grid {grid_id} is not done in time: {grid.counts.ended} of {grid.n_runs} have ended"
                 )
-            time.sleep(every_s)
+            wait_s = min(every_s, _LONGEST_WAIT_S)
 
     def runs(self, grid_id: str, state: str | None = None) -> Iterator[RunView]:
         """All runs of a grid, or those in a state, page by page."""

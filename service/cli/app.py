@@ -18,6 +18,7 @@ from service.cli.connection import settings as _settings
 from service.cli.figures import figures
 from service.cli.measuring import measure
 from service.cli.replay import replay
+from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
+app.add_typer(tokens, name="token")
 for command in (*grids.COMMANDS, *pictures.COMMANDS, figures, measure, replay):
     app.command()(command)
 

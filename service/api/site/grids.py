@@ -12,7 +12,7 @@ from fastapi.responses import RedirectResponse
 
 from engine import GROUPINGS
 from service.api.context import Context, GridId, Service
-from service.api.site.origin import OwnPage
+from service.api.gate import Asking, require_owner
 from service.api.site.questions import (
     DEFAULT_ESTIMATE,
     SHOWN_AXES,
@@ -130,9 +130,13 @@ def progress(grid_id: GridId, service: Service) -> Response:
 
 @router.post("/grids/{grid_id}/{action}")
 def act(
-    grid_id: GridId, action: Literal["cancel", "pause", "resume", "retry"], service: Service, _own: OwnPage
+    grid_id: GridId,
+    action: Literal["cancel", "pause", "resume", "retry"],
+    service: Service,
+    caller: Asking,
 ) -> Response:
     """Do something to a grid and show it again."""
+    require_owner(caller, service.grids, grid_id)
     actions: dict[str, Callable[[str], object]] = {
         "cancel": service.grids.cancel,
         "pause": service.grids.pause,

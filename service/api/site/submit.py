@@ -27,8 +27,8 @@ from engine import (
     system_names,
 )
 from service.api.context import Context, Service
+from service.api.gate import Asking
 from service.api.problems import UnsupportedBodyError
-from service.api.site.origin import OwnPage
 from service.api.threads import PATIENT, Route, run_in
 from service.domain.requests import GridRequest, Plan, TooManyRunsError, plan
 from service.web.form import Field, document_of, field_of, form_fields
@@ -66,16 +66,16 @@ def empty_form() -> Response:
 
 
 @router.post("/submit")
-async def submitted(request: Request, service: Service, _own: OwnPage) -> Response:
+async def submitted(request: Request, service: Service, caller: Asking) -> Response:
     """Check what was filled in, or start it and go to its page; the form again where something is wrong."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != _FORM:
         raise UnsupportedBodyError("content-type", kind, _FORM, {"Accept-Post": _FORM})
     typed = parse_qs((await request.body()).decode("utf-8", "replace"), max_num_fields=_MOST_FIELDS)
-    return await run_in(PATIENT, _take, service, {name: values[-1] for name, values in typed.items()})
+    return await run_in(PATIENT, _take, service, caller.name, {name: values[-1] for name, values in typed.items()})
 
 
-def _take(service: Context, typed: Mapping[str, str]) -> Response:
+def _take(service: Context, owner: str | None, typed: Mapping[str, str]) -> Response:
     fields = [replace(field, value=typed.get(field.name, "")) for field in _fields()]
     document, wrong = document_of(fields, typed, _json)
     body, runs = None, None
@@ -88,7 +88,13 @@ def _take(service: Context, typed: Mapping[str, str]) -> Response:
         dry = {"n_runs": len(runs), "labels": [run.label for run in islice(runs, _SHOWN_LABELS)]}
         return _page(fields, dry=dry)
     made = service.grids.create(
-        body.canonical(), lambda: runs, body.name, f"page:{key}" if key else None, engine_digest()
+        body.canonical(),
+        lambda: runs,
+        body.name,
+        f"page:{key}" if key else None,
+        engine_digest(),
+        owner,
+        lambda: service.costs.expected_wall_s(runs.kinds()),
     )
     return RedirectResponse(f"/grids/{made.grid.id}", 303, {"Cache-Control": "no-store"})
 
