@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -130,7 +131,7 @@ def act(
     grid_id: GridId, action: Literal["cancel", "pause", "resume", "retry"], service: Service, _own: OwnPage
 ) -> Response:
     """Do something to a grid and show it again."""
-    actions = {
+    actions: dict[str, Callable[[str], object]] = {
         "cancel": service.grids.cancel,
         "pause": service.grids.pause,
         "resume": service.grids.resume,
