@@ -15,6 +15,7 @@ import service
 from service.cli import grids, pictures
 from service.cli.connection import FailedError, console
 from service.cli.connection import settings as _settings
+from service.cli.figures import figures
 from service.cli.measuring import measure
 from service.cli.replay import replay
 from service.runtime.start import CONFIGURATION, ConfigurationError
@@ -62,7 +63,7 @@ app = typer.Typer(
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, measure, replay):
+for command in (*grids.COMMANDS, *pictures.COMMANDS, figures, measure, replay):
     app.command()(command)
 
 

@@ -44,6 +44,8 @@ _KINDS = (
     "grid", "grid_cancelled", "grid_paused", "grid_resumed", "grid_revived", "run_started", "run_done", "run_failed",
     "run_quarantined", "run_cancelled", "run_requeued",
 )  # fmt: skip
+_FORMAT_NAMES = {"csv": "CSV", "ecsv": "ECSV", "parquet": "Parquet", "vot": "VOTable", "fits": "FITS"}
+"""Files of results, by what the address ends with."""
 _FIGURES: tuple[tuple[FigureKind, str, str], ...] = (
     ("bias", "Biases", "Biases of magnitude, radius and index by serial number, and their means"),
     ("sample", "Sample", "Bias of the magnitude against arc, contrast and surface brightness"),
@@ -184,9 +186,10 @@ def _figure(grid: GridView, shown: dict[str, str]) -> dict[str, Any]:
 
 
 def _downloads(grid_id: str) -> list[tuple[str, str]]:
+    files = [(_FORMAT_NAMES[kind], f"/v1/results.{kind}?grid={grid_id}") for kind in _FORMAT_NAMES]
     return [
-        ("Results as JSON", f"/v1/results?grid={grid_id}"),
-        ("Biases as JSON", f"/v1/summary?grid={grid_id}"),
-        ("Runs", f"/v1/grids/{grid_id}/runs"),
-        ("Events", f"/v1/grids/{grid_id}/events"),
+        *files,
+        ("Results (JSON)", f"/v1/results?grid={grid_id}"),
+        ("Biases (JSON)", f"/v1/summary?grid={grid_id}"),
+        ("Runs (JSON)", f"/v1/grids/{grid_id}/runs"),
     ]

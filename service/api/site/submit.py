@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 from typing import Any
 from urllib.parse import parse_qs
@@ -46,8 +47,8 @@ _LABELS = {
 _HINTS = {
     "name": "what it is called in lists and figures",
     "preset": "a part of the grid of the paper",
-    "systems": f"of {', '.join(system_names())}; or a list of objects as JSON",
-    "camera": f"instead of the systems' own: {', '.join(camera_names())}; or an object as JSON",
+    "systems": f"of {', '.join(system_names())}; or a system of your own as JSON",
+    "camera": f"instead of the systems' own: {', '.join(camera_names())}; or a camera of your own as JSON",
     "mass_model": "of the systems",
     "n": "as 1, 2, 4",
     "r_eff": "half-light radius [arcsec]",
@@ -121,7 +122,8 @@ def _planned(
         return None, None, {"systems": str(error)}
 
 
-def _fields() -> list[Field]:
+@cache
+def _fields() -> tuple[Field, ...]:
     found = []
     for field in form_fields(GridRequest.model_json_schema()):
         said = "; ".join(filter(None, (_HINTS.get(field.name, ""), field.hint)))
@@ -130,11 +132,11 @@ def _fields() -> list[Field]:
         label = _LABELS.get(field.name, field.label)
         found.append(replace(field, label=label, hint=said, options=options, blank=blank))
     order = {name: place for place, name in enumerate(_MAIN)}
-    return sorted(found, key=lambda field: order.get(field.name, len(order)))
+    return tuple(sorted(found, key=lambda field: order.get(field.name, len(order))))
 
 
 def _page(
-    fields: list[Field],
+    fields: Sequence[Field],
     wrong: Mapping[str, str] | None = None,
     dry: dict[str, Any] | None = None,
     key: str = "",
