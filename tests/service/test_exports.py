@@ -20,7 +20,7 @@ import pandas
 import pytest
 from astropy.io import fits
 from astropy.io.votable import parse
-from astropy.table import Table
+from astropy.table import QTable, Table
 from fastapi.testclient import TestClient
 from pyarrow import parquet
 from sqlalchemy import update
@@ -139,6 +139,8 @@ def test_ecsv_is_read_by_astropy_with_units_descriptions_and_where_it_comes_from
         row[[column.name for column in columns].index("engine_digest")] for row in rows
     }
     datetime.fromisoformat(table.meta["picture_at"])
+    quantities = QTable.read(stored.file("ecsv", specs="true").decode().splitlines(), format="ascii.ecsv")
+    assert quantities["system", "magnitude", "magnitude_mean"]["magnitude_mean"].unit == "mag"
 
 
 def test_csv_is_read_by_pandas(stored: Stored) -> None:
