@@ -219,9 +219,13 @@ class Client:
 
         return as_frame(*self._whole(grid_ids, asked))
 
-    def figure(self, grid_id: str, name: str = "bias", kind: str = "svg") -> bytes:
-        """A figure of a grid as an SVG or PNG file: bias, sample, coverage, pull, trends or montage."""
-        return self._connection.file(f"/v1/grids/{_part(grid_id)}/figures/{_part(name)}.{_part(kind)}")
+    def figure(self, grid_id: str | None, name: str = "bias", kind: str = "svg", **asked: Filter) -> bytes:
+        """A figure as an SVG or PNG file: bias, sample, coverage, pull, trends, and of a grid montage.
+
+        Of a grid, or over all where that is None; ``asked`` are filters and how it is drawn, as ``system="HE0435"``.
+        """
+        of = "/v1" if grid_id is None else f"/v1/grids/{_part(grid_id)}"
+        return self._connection.file(_address(f"{of}/figures/{_part(name)}.{_part(kind)}", (), asked))
 
     def run_figure(self, run_id: str) -> bytes:
         """The figure of a run, a PNG file: observation, model, residual, source."""

@@ -65,6 +65,7 @@ def test_three_ways_from_a_file_to_the_biases_of_a_lens_give_the_same(tmp_path: 
         ours, by_curl, by_command = service.client.grids().items
         by_command_rows = service.client.summary(by_command.id, group_by="n").rows
     assert by_command.name == "my own lens"
+    assert "<svg" in (tmp_path / "my_biases.svg").read_text()[:2000]
     assert (tmp_path / "my_biases.png").read_bytes().startswith(b"\x89PNG")
     # What the engine says of the same hosts, to the last digit that is told.
     system = read_system(str(ROOT / "docs/examples/my_system.toml"))

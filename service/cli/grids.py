@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.cli.connection import Token, Url, connected, console
+from service.cli.outputs import as_file_name, require_folder
 from service.cli.request_file import named_or_read, read_request
 
 if TYPE_CHECKING:
@@ -32,6 +34,13 @@ class Format(StrEnum):
     TABLE = "table"
     JSON = "json"
     CSV = "csv"
+
+
+class Picture(StrEnum):
+    """Kinds of files that figures are drawn to."""
+
+    SVG = "svg"
+    PNG = "png"
 
 
 def submit(
@@ -136,6 +145,37 @@ def results(
         _show(found, style)
 
 
+def figures(
+    grid: GridArgument,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the files; made where it is missing")] = Path(),
+    kind: Annotated[Picture, typer.Option("--format")] = Picture.SVG,
+    url: Url = None,
+    token: Token = None,
+) -> None:
+    """Save the figures of a grid. Biases of each system, the sample, coverage, pulls, trends, and a montage."""
+    require_folder(out)
+    with connected(url, token) as client:
+        from service.client import ApiError  # noqa: PLC0415 - as above
+
+        systems = [str(row.group["system"]) for row in client.summary(grid).rows]
+        wanted: list[tuple[str, str, dict[str, str]]] = [
+            (f"bias_{as_file_name(system)}", "bias", {"system": system}) for system in systems
+        ]
+        wanted += [(name, name, {}) for name in ("sample", "coverage", "pull", "trends", "montage")]
+        for stem, name, asked in wanted:
+            try:
+                with _asking():
+                    data = client.figure(grid, name, kind, **asked)
+            except ApiError as error:
+                # A montage of too many runs, say: the others can be drawn. Without a result none of them can.
+                if error.status != HTTPStatus.UNPROCESSABLE_ENTITY:
+                    raise
+                typer.echo(f"no {name}: {error}", err=True)
+                continue
+            (out / f"{stem}.{kind}").write_bytes(data)
+            typer.echo(out / f"{stem}.{kind}")
+
+
 def cancel(grid: GridArgument, url: Url = None, token: Token = None) -> None:
     """Cancel a grid."""
     with connected(url, token) as client:
@@ -176,7 +216,7 @@ def retry(
         _tell(found)
 
 
-COMMANDS = (submit, status, results, cancel, pause, resume, retry)
+COMMANDS = (submit, status, results, figures, cancel, pause, resume, retry)
 
 
 def _tell(grid: GridView) -> None:

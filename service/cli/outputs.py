@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Collection, Iterable
 from pathlib import Path
@@ -10,6 +11,11 @@ import typer
 
 PICTURES = frozenset({".png", ".pdf", ".svg"})
 FITS = frozenset({".fits", ".fit"})
+
+
+def as_file_name(name: str) -> str:
+    """The name of a system of anybody's, without what a file cannot be called."""
+    return re.sub(r"[^\w.+-]", "_", name)[:80]
 
 
 def require_folder(folder: Path) -> None:

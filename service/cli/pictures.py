@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.outputs import PICTURES, require_file, require_folder, require_kind, require_readable
+from service.cli.outputs import PICTURES, as_file_name, require_file, require_folder, require_kind, require_readable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -150,7 +149,7 @@ def inversion(
         from engine.figures import inversion_figure  # noqa: PLC0415
 
         realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
-        path = out or Path(f"{_as_file(realization.system_name)}_inversion.png")
+        path = out or Path(f"{as_file_name(realization.system_name)}_inversion.png")
         require_folder(path.parent)
         require_file(path, PICTURES)
         with _progress(f"inverting {realization.system_name}", 3) as advance:
@@ -227,7 +226,7 @@ def _write_one(realization: Realization, out: Path) -> None:
     host = realization.host
     # The digest in the name: another seed or camera is another file, and the same command writes the same one again.
     stem = (
-        f"{_as_file(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
+        f"{as_file_name(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
         f"_{realization.digest[:8]}"
     )
     require_folder(out)
@@ -243,11 +242,6 @@ def _write_one(realization: Realization, out: Path) -> None:
     record = simulation.observation.provenance
     if record["NOISE"] != record["NOISEREQ"]:
         typer.echo(f"the camera has no noise level {record['NOISEREQ']!r}: {record['NOISE']!r} was used", err=True)
-
-
-def _as_file(name: str) -> str:
-    """The name of a system of anybody's, without what a file cannot be called."""
-    return re.sub(r"[^\w.+-]", "_", name)[:80]
 
 
 def _save(figure: Figure, path: Path) -> None:

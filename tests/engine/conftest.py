@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.simulate import Simulation, simulate
 from engine.spec.analysis import Analysis
@@ -11,6 +12,8 @@ from engine.spec.sky import Host
 
 QUICK = Analysis(source_pixels=(12, 12), max_steps=10, draws=4)
 """An analysis of seconds, for what does not depend on its quality."""
+HELD_INDEX = 2.02
+"""Where the fit of the session holds n beside leaving it free: some deviations from the n = 2 of the simulation."""
 
 
 @pytest.fixture(scope="session")
@@ -26,3 +29,9 @@ def scene(realization: Realization) -> Scene:
 @pytest.fixture(scope="session")
 def simulation(scene: Scene) -> Simulation:
     return simulate(scene, "author", np.random.default_rng(1))
+
+
+@pytest.fixture(scope="session")
+def fit(scene: Scene, simulation: Simulation) -> ParametricFit:
+    """Of the simulation, its four AGN known; made once for all tests."""
+    return fit_parametric(simulation.observation, agn_images=len(scene.agn), fixed_index=HELD_INDEX)

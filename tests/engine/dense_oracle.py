@@ -7,8 +7,9 @@ import numpy as np
 from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
-from engine.source.lensing_matrix import cast_rays, map_rays
-from engine.source.regularisation import SourceModel, sparse_regularisation
+from engine.source.lensing_matrix import cast_rays
+from engine.source.regularisation import SourceModel
+from tests.engine.plain_matrices import lensing_matrix, nodes_round, regularisation, traced
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
 SCALE = 0.1
@@ -56,14 +57,12 @@ class Case:
         else:
             self.covariance = sigma**2
         self.columns = rng.normal(size=(m, amplitudes)) + 0.3
-        model = SourceModel((12, 12))
-        mapping = map_rays(self.rays, LENS, model.shape)
-        sx, sy = np.meshgrid(mapping.grid.x, mapping.grid.y)
+        x, y = (v.reshape(-1, subrays**2)[self.rays.in_mask] for v in traced(LENS, self.rays.x, self.rays.y))
+        sx, sy = np.meshgrid(nodes_round(x, 12), nodes_round(y, 12))
         source = 4000.0 * np.exp(-0.5 * ((sx - 0.05) ** 2 + (sy + 0.03) ** 2) / 0.15**2)
         self.blurring = blurring_matrix(self.psf, np.nonzero(self.mask), np.nonzero(self.rayed))
-        self.data = (
-            self.blurring @ mapping.apply(source.ravel()) + self.columns.sum(axis=1) + sigma * rng.normal(size=m)
-        )
+        light = lensing_matrix(self.rays, LENS, (12, 12)) @ source.ravel()
+        self.data = self.blurring @ light + self.columns.sum(axis=1) + sigma * rng.normal(size=m)
         # The last amplitude alone has a Gaussian prior.
         self.precisions = np.zeros(amplitudes)
         if amplitude_sd is not None:
@@ -73,14 +72,17 @@ class Case:
     def likelihood(self) -> MarginalLikelihood:
         return marginalise_amplitudes(self.linear, self.blurring, self.rays)
 
+    def lensing_matrix(self, lens: PowerLawLens, shape: tuple[int, int]) -> np.ndarray:
+        """L (P, ny nx), made otherwise than the engine's."""
+        return lensing_matrix(self.rays, lens, shape)
+
     def oracle(self, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> tuple[float, np.ndarray, np.ndarray]:
         """ln Z, source and its covariance from explicit G, C, H with the amplitudes as extra columns of G."""
-        mapping = map_rays(self.rays, lens, model.shape)
-        g = np.hstack([self.blurring @ mapping.dense(), self.columns])
+        g = np.hstack([self.blurring @ self.lensing_matrix(lens, model.shape), self.columns])
         n, k, m = model.shape[0] * model.shape[1], self.columns.shape[1], self.data.size
         c = np.diag(self.covariance) if self.covariance.ndim == 1 else self.covariance
         inverse = np.linalg.inv(c)
-        h = sparse_regularisation(model).toarray()
+        h = regularisation(model)
         a = g.T @ inverse @ g
         a[:n, :n] += math.exp(ln_lambda) * h
         a[n:, n:] += np.diag(self.precisions)

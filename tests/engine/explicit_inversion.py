@@ -1,4 +1,4 @@
-"""An inversion written out: every matrix explicit, pixel by pixel, sharing only the ray tracer with the engine."""
+"""An inversion written out: every matrix explicit, pixel by pixel, nothing shared with the engine's arithmetic."""
 
 import math
 from dataclasses import dataclass, replace
@@ -9,10 +9,11 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.signal import convolve2d
 
 from engine.imaging.optics.stamp_matrix import blurring_matrix
-from engine.lensing.power_law import PowerLawLens, source_position
+from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.source.lensing_matrix import RayBundle, cast_rays
 from engine.source.regularisation import SourceModel
+from tests.engine.plain_matrices import hats, nodes_round, regularisation, traced
 
 LENS = PowerLawLens(0.8, 0.8, 0.4, 2.05, 0.02, -0.01, 0.03, 0.02)
 SCALE = 0.1
@@ -117,13 +118,12 @@ class Explicit:
         x, y = self.axes
         steps = ((np.arange(self.subrays) + 0.5) / self.subrays - 0.5) * SCALE
         dx, dy = (d.ravel() for d in np.meshgrid(steps, steps))
-        return source_position(self.lens, x[..., None] + dx, y[..., None] + dy)
+        return traced(self.lens, x[..., None] + dx, y[..., None] + dy)
 
     def nodes(self, model: SourceModel) -> tuple[np.ndarray, np.ndarray]:
         out = []
         for values, n in zip(self._rays(), model.shape[::-1], strict=True):
-            low, high = values[self.chosen].min(), values[self.chosen].max()
-            out.append(low + (high - low) * np.arange(n) / (n - 1))
+            out.append(nodes_round(values[self.chosen], n))
         return out[0], out[1]
 
     def source_columns(self, model: SourceModel) -> np.ndarray:
@@ -133,7 +133,7 @@ class Explicit:
         light = np.zeros((SIDE, SIDE, ny, nx))
         for row, column in np.argwhere(self.rayed):
             for u, v in zip(bx[row, column], by[row, column], strict=True):
-                a, b = _hats(x, u), _hats(y, v)
+                a, b = hats(x, u), hats(y, v)
                 light[row, column] += np.outer(b, a)
         light *= SCALE**2 / self.subrays**2
         psf, flat = stamp(self.psf), light.reshape(SIDE, SIDE, ny * nx)
@@ -172,15 +172,6 @@ class Explicit:
         return replace(self, **values)  # type: ignore[arg-type]
 
 
-def _hats(nodes: np.ndarray, value: float) -> np.ndarray:
-    """Piecewise linear: one at a node, zero at its neighbours, with ghosts a quarter of a cell beyond the ends."""
-    low, high = nodes[0] - 0.25 * (nodes[1] - nodes[0]), nodes[-1] + 0.25 * (nodes[-1] - nodes[-2])
-    ghosts = np.concatenate([[low], nodes, [high]])
-    rising = (value - ghosts[:-2]) / np.diff(ghosts)[:-1]
-    falling = (ghosts[2:] - value) / np.diff(ghosts)[1:]
-    return np.clip(np.minimum(rising, falling), 0.0, None)
-
-
 @dataclass(frozen=True)
 class Answer:
     ln_evidence: float
@@ -193,18 +184,3 @@ class Answer:
         unit = np.zeros((self.lu[0].shape[0], which.size))
         unit[which, np.arange(which.size)] = 1.0
         return lu_solve(self.lu, unit)[: self.source.size]
-
-
-def regularisation(model: SourceModel) -> np.ndarray:
-    """H from its definition."""
-    ny, nx = model.shape
-    if model.regularisation == "zeroth":
-        return np.eye(ny * nx)
-
-    def second(n: int) -> np.ndarray:
-        return 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-
-    tx, ty = second(nx), second(ny)
-    if model.regularisation == "curvature":
-        tx, ty = tx @ tx, ty @ ty
-    return np.asarray(np.kron(np.eye(ny), tx) + np.kron(ty, np.eye(nx)))

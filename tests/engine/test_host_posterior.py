@@ -17,10 +17,9 @@ from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.priors import ParameterPrior
+from tests.engine.conftest import HELD_INDEX
 
 N = COORDINATES.index("n")
-HELD = 2.02
-"""Some deviations from the n = 2 of the simulation."""
 
 
 def posterior(sd: float = 0.05, n: float = 2.0, low: float = 0.3, high: float = 8.0) -> HostPosterior:
@@ -114,11 +113,6 @@ def test_errors_that_are_larger_are_larger_in_everything() -> None:
         assert getattr(two, name).sd == pytest.approx(1.5 * getattr(one, name).sd, rel=1e-9)
 
 
-@pytest.fixture(scope="module")
-def fit(scene: Scene, simulation: Simulation) -> ParametricFit:
-    return fit_parametric(simulation.observation, agn_images=len(scene.agn), fixed_index=HELD)
-
-
 def test_the_wide_posterior_is_the_fit(fit: ParametricFit) -> None:
     wide = fit.hosts["wide"]
     for name in ("flux", "r_eff", "n", "q", "x", "y"):
@@ -127,10 +121,10 @@ def test_the_wide_posterior_is_the_fit(fit: ParametricFit) -> None:
 
 def test_a_fit_with_n_held_is_where_the_gaussian_says_and_narrower(fit: ParametricFit) -> None:
     wide, fixed = fit.hosts["wide"], fit.hosts["fixed"]
-    assert fixed.profile.n == pytest.approx(HELD)
+    assert fixed.profile.n == pytest.approx(HELD_INDEX)
     assert not fixed.n_at_bound
     sd = np.sqrt(np.diag(wide.covariance))
-    away = (HELD - wide.mean[N]) / sd[N]
+    away = (HELD_INDEX - wide.mean[N]) / sd[N]
     assert 1.0 < abs(away) < 5.0
     expected = wide.mean + wide.covariance[:, N] / sd[N] * away
     # Over some deviations the Gaussian is good to a tenth of the way.
@@ -177,6 +171,7 @@ def test_a_faint_arc_does_not_lead_the_host_astray(n: float, r_eff: float, magni
     assert abs(found_magnitude - magnitude) < 2.6 * sd
 
 
+@pytest.mark.long
 def test_hosts_of_drawn_systems_are_covered() -> None:
     """A dozen of the systems of ``benchmarks.coverage``, which takes 200."""
     pulls = []

@@ -56,7 +56,7 @@ def random_configurations(number: int) -> list[tuple[PowerLawLens, float, float]
 
 
 def test_the_images_are_those_of_lenstronomy() -> None:
-    for lens, x, y in random_configurations(60):
+    for lens, x, y in random_configurations(25):
         ours, theirs = solve_lens_equation(lens, x, y), lenstronomy_images(lens, x, y)
         assert len(ours) == len(theirs), (lens, x, y)
         for px, py, mu in theirs:
@@ -73,9 +73,21 @@ def test_every_image_maps_back_to_the_source_and_parities_add_up() -> None:
         assert np.allclose(bx, x, rtol=0, atol=1e-11)
         assert np.allclose(by, y, rtol=0, atol=1e-11)
         parities = [1 if image.magnification > 0 else -1 for image in images]
-        # Burke's theorem without the central image, which the singular centre swallows for slope >= 2.
-        assert len(images) in {1, 2, 3, 4, 5}
-        assert sum(parities) in {-0, 0, 1}
+        # Burke's theorem: minima and maxima are one more than saddles. A slope of 2 and more swallows the maximum, and
+        # just below 2 it stands nearer to the centre than any number can say.
+        total, number = sum(parities), len(images)
+        if lens.slope > 2.0:
+            assert (total, number) in {(0, 2), (0, 4)}, (lens, x, y)
+        elif lens.slope < 1.9 and total == 0:
+            solver = AngularSolver(lens)
+            faint = min(solver.images(x, y), key=lambda found: math.hypot(found[0] - lens.x, found[1] - lens.y))
+            # The central image, a hundred thousand times fainter than what would be asked for.
+            assert abs(solver.inverse_magnification(*faint)) > 1e7, (lens, x, y)
+            assert number in {2, 4}
+        elif lens.slope < 1.9:
+            assert (total, number) in {(1, 1), (1, 3), (1, 5)}, (lens, x, y)
+        else:
+            assert (total, number) in {(0, 2), (0, 4), (1, 1), (1, 3), (1, 5)}, (lens, x, y)
 
 
 @pytest.mark.parametrize("name", system_names())
@@ -129,11 +141,13 @@ def any_lens(rng: np.random.Generator) -> PowerLawLens:
     )
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_all_images_parities_and_magnifications_are_those_of_an_independent_solver(part: int) -> None:
-    # 10,000 configurations in all, every other one within 1e-7 to 1e-2 theta_E of the tangential caustic.
+@pytest.mark.parametrize(
+    ("part", "number"), [(0, 500), *(pytest.param(part, 2500, marks=pytest.mark.long) for part in range(4))]
+)
+def test_all_images_parities_and_magnifications_are_those_of_an_independent_solver(part: int, number: int) -> None:
+    # 10,000 configurations in the long ones, every other within 1e-7 to 1e-2 theta_E of the tangential caustic.
     rng, found_by_both = np.random.default_rng([2017, part]), 0
-    for k in range(2500):
+    for k in range(number):
         lens = any_lens(rng)
         radius, angle = lens.theta_E * rng.uniform() ** 0.5, rng.uniform(0, 2 * math.pi)
         x, y = lens.x + radius * math.cos(angle), lens.y + radius * math.sin(angle)
@@ -158,32 +172,4 @@ def test_all_images_parities_and_magnifications_are_those_of_an_independent_solv
             assert abs(solver.source(image.x, image.y) - complex(x, y)) < 1e-11, where
             assert all(math.hypot(image.x - other.x, image.y - other.y) > 1e-5 * lens.theta_E for other in ours[:i])
         found_by_both += sum(abs(inverse) <= 100.0 for *_, inverse in theirs)
-    assert found_by_both > 2 * 2500  # the comparison is not empty
-
-
-def test_two_images_are_born_on_crossing_the_astroid() -> None:
-    lens = PowerLawLens(1.0, 0.7, 0.0, 2.0)
-    inside, outside = None, None
-    low, high = 0.0, 0.6
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        count = len(solve_lens_equation(lens, middle, 0.03))
-        low, high = (middle, high) if count == 4 else (low, middle)
-        inside, outside = low, high
-    assert inside is not None
-    assert outside is not None
-    # The astroid's cusp on this axis lies where four images become two, found here to 1e-6 of the Einstein radius.
-    assert high - low < 1e-6
-    assert len(solve_lens_equation(lens, inside - 1e-5, 0.03)) == 4
-    assert len(solve_lens_equation(lens, outside + 1e-5, 0.03)) == 2
-
-
-def test_a_source_far_away_has_one_image() -> None:
-    lens = PowerLawLens(1.0, 0.8, 0.3, 2.0)
-    (image,) = solve_lens_equation(lens, 30.0, -20.0)
-    assert image.magnification == pytest.approx(1.0, abs=0.05)
-
-
-def test_the_central_image_of_a_shallow_profile_is_left_out() -> None:
-    lens = PowerLawLens(1.2, 0.85, 0.3, 1.8)
-    assert len(solve_lens_equation(lens, 0.01, 0.02)) == 4
+    assert found_by_both > 2 * number  # the comparison is not empty

@@ -62,12 +62,12 @@ def test_noise_alone_has_the_chi2_and_the_scatter_of_its_covariance_only(observe
     factor, sigma, m = np.linalg.cholesky(covariance), np.sqrt(np.diag(covariance)), mask.size
     paper = observed.problems["paper_code"].likelihood.whitened.covariance[chosen]
     white, diagonal, coded = [], [], []
-    for _ in range(300):
+    for _ in range(120):
         noise = observed.noise(rng)[chosen]
         white.append(np.sum(solve_triangular(factor, noise, lower=True) ** 2) / m)
         diagonal.append(np.sum((noise / sigma) ** 2) / m)
         coded.append(np.sum((noise / paper) ** 2) / m)
-    # 300 draws know the mean to 0.002 and the deviation to 4 %.
+    # 120 draws know the mean to 0.003 and the deviation to 6.5 %.
     assert np.mean(white) == pytest.approx(1.0, abs=0.01)
     assert np.std(white) == pytest.approx(math.sqrt(2 / m), rel=0.15)
     # The diagonal has the right mean by construction, and a wrong scatter: sum of squared correlations, not M.
@@ -96,7 +96,7 @@ def test_an_inversion_of_drizzled_noise_has_chi2_one_with_the_covariance_and_not
         parts[name] = basis, whiten(problem, problem.likelihood.blurring.toarray())
     chi2: dict[str, list[float]] = {name: [] for name in names}
     source_error: dict[str, list[float]] = {name: [] for name in names}
-    for _ in range(24):
+    for _ in range(12):
         data = arc + observed.noise(rng)
         for name in names:
             problem = observed.problems[name]
@@ -109,8 +109,8 @@ def test_an_inversion_of_drizzled_noise_has_chi2_one_with_the_covariance_and_not
             chi2[name].append(likelihood.chi2(fitted, likelihood.fit_amplitudes(fitted)) / freedom)
             off = (inversion.source - truth.source).ravel()
             source_error[name].append(float(off @ inversion.curvature @ off) / gamma)
-    # One realization scatters by 0.04; 24 know the mean to 0.009.
-    assert np.mean(chi2["covariance"]) == pytest.approx(1.0, abs=0.03)
+    # One realization scatters by 0.04; twelve know the mean to 0.012.
+    assert np.mean(chi2["covariance"]) == pytest.approx(1.0, abs=0.04)
     assert np.mean(chi2["diagonal"]) < 0.94
     # The error of the source in units of what the data determine it to: stated rightly, and understated. A source
     # is pulled towards its prior, which is worth ten per cent.

@@ -58,16 +58,6 @@ def find(simulation: Simulation, fit: ParametricFit, analysis: Analysis, lens: P
 
 
 @pytest.fixture(scope="module")
-def simulation() -> Simulation:
-    return simulate_realization(Realization(system="HE0435", l_eta=1.0, host=BRIGHT))
-
-
-@pytest.fixture(scope="module")
-def fit(simulation: Simulation) -> ParametricFit:
-    return fit_parametric(simulation.observation, agn_images=4)
-
-
-@pytest.fixture(scope="module")
 def usual(simulation: Simulation, fit: ParametricFit) -> Found:
     return find(simulation, fit, Analysis(), simulation.scene.lens)
 

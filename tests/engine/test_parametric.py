@@ -17,7 +17,7 @@ from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.likelihood.problem import CORE_BOOST, prepare_problem, ring_mask
-from engine.parametric.fit import GOOD_START, ParametricFit, fit_parametric
+from engine.parametric.fit import GOOD_START, ParametricFit
 from engine.parametric.lens_start import lens_from_positions
 from engine.parametric.model import ImageModel
 from engine.parametric.parameters import ParameterSpace
@@ -29,11 +29,6 @@ from engine.parametric.starts import ring_radii
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
 from engine.spec.analysis import Analysis
-
-
-@pytest.fixture(scope="module")
-def fit(simulation: Simulation) -> ParametricFit:
-    return fit_parametric(simulation.observation, agn_images=4)
 
 
 def test_the_agn_images_are_found_within_a_tenth_of_a_pixel(scene: Scene, simulation: Simulation) -> None:
@@ -133,29 +128,6 @@ def test_what_a_fit_misses_is_noise_to_the_inversion_where_stars_are_stamps(
     assert np.allclose(sigma[1], 2.0 * sigma[0])
     exact = [prepare_problem(simulation.observation, found, analysis) for found in (good, poor)]
     assert np.array_equal(*(problem.likelihood.whitened.covariance for problem in exact))
-
-
-def test_the_noise_treatments_differ_as_they_say(simulation: Simulation, fit: ParametricFit) -> None:
-    observation = simulation.observation
-    paper = prepare_problem(observation, fit, Analysis(noise_treatment="paper_code"))
-    clear = ~paper.core[paper.mask]
-    expected = observation.noise**2 + 0.01 * np.abs(observation.image)
-    assert np.allclose(paper.likelihood.whitened.covariance[clear] ** 2, expected[paper.mask][clear])
-    full = prepare_problem(observation, fit, Analysis(noise_treatment="covariance"))
-    factor = full.likelihood.whitened.covariance
-    assert factor.shape == (paper.mask.sum(),) * 2
-    variance = (factor**2).sum(axis=1)
-    assert np.allclose(variance[clear], observation.noise[paper.mask][clear] ** 2, rtol=1e-6)
-    with pytest.raises(ObservationError, match="covariance"):
-        prepare_problem(replace(observation, covariance=None), fit, Analysis(noise_treatment="covariance"))
-
-
-def test_a_ring_without_valid_pixels_is_refused(simulation: Simulation, fit: ParametricFit) -> None:
-    observation = simulation.observation
-    corner = np.zeros(observation.shape, dtype=bool)
-    corner[0, 0] = True
-    with pytest.raises(ObservationError, match="mask"):
-        prepare_problem(replace(observation, valid=corner), fit, Analysis(noise_treatment="diagonal"))
 
 
 def _lensed(observation: Observation, *, shear: bool = False) -> tuple[ImageModel, np.ndarray]:

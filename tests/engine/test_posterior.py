@@ -2,15 +2,13 @@
 
 import math
 
-import emcee
 import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
-from engine.posterior.proposal import StudentProposal
-from engine.posterior.surrogate import Surrogate, learn_surrogate
+from engine.posterior.surrogate import learn_surrogate
 from engine.posterior.target import Prior, Recorded, Target, wide_prior
 from engine.source.regularisation import SourceModel
 from tests.engine.dense_oracle import LENS, Case
@@ -99,25 +97,6 @@ def test_a_chain_follows_a_posterior_that_bends() -> None:
     assert np.abs(flat.std(axis=0) / target.sd - 1).max() < 10 * error
 
 
-def test_a_surrogate_that_is_wrong_costs_acceptance_and_nothing_else() -> None:
-    target = Gaussian()
-    wrong = Gaussian()
-    wrong.mean = target.mean + 0.4 * np.linalg.cholesky(target.covariance).sum(axis=1)
-    random = np.random.RandomState(3)
-    points = StudentProposal(wrong.mean, wrong.covariance).draw(200, random)
-    values = np.array([wrong(point) for point in points])
-    surrogate = Surrogate(target.prior, points, values, wrong.mean, wrong.covariance)
-    sampler = emcee.EnsembleSampler(50, 5, target, moves=emcee.moves.MHMove(surrogate))
-    sampler.run_mcmc(emcee.State(points[:50], random_state=random.get_state()), 400, skip_initial_state_check=True)
-    chain = sampler.get_chain(discard=50)
-    assert 0.1 < sampler.acceptance_fraction.mean() < 0.8
-    error = math.sqrt(autocorrelation_time(chain) / (chain.shape[0] * chain.shape[1]))
-    sd = np.sqrt(np.diag(target.covariance))
-    flat = chain.reshape(-1, 5)
-    assert np.abs((flat.mean(axis=0) - target.mean) / sd).max() < 5 * error
-    assert np.abs(flat.std(axis=0) / sd - 1).max() < 5 * error
-
-
 def test_a_surrogate_knows_what_it_was_told_and_nothing_outside_the_prior() -> None:
     target = Banana()
     known = Recorded(target)
@@ -146,51 +125,6 @@ def test_a_target_that_is_nothing_wherever_it_is_asked_is_refused() -> None:
     known = find_optimum(Gaussian(), target.mean, np.eye(5))
     with pytest.raises(PosteriorError, match="outside the prior"):
         run_chain(target, known, walkers=8, max_steps=50, rng=np.random.default_rng(0))
-
-
-class Hills:
-    """A normal hill, and three tenths of the weight on one half as wide, three deviations away."""
-
-    away, width, weight = 3.0, 0.5, 0.3
-
-    def __init__(self, dimensions: int = 5) -> None:
-        self.prior = Prior.flat(tuple("abcdefgh"[:dimensions]), np.full(dimensions, -30.0), np.full(dimensions, 30.0))
-        self.evaluations = 0
-
-    def __call__(self, values: np.ndarray) -> float:
-        self.evaluations += 1
-        other = (values - self.away * np.eye(values.size)[0]) / self.width
-        ln_other = math.log(self.weight) - values.size * math.log(self.width) - 0.5 * other @ other
-        return float(np.logaddexp(math.log(1.0 - self.weight) - 0.5 * values @ values, ln_other))
-
-
-def test_a_chain_that_mixes_badly_is_restarted_and_the_surrogate_has_learnt_from_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    known_before = []
-
-    def counted(known, prior, laplace, random):
-        known_before.append(len(known.values))
-        return learn_surrogate(known, prior, laplace, random)
-
-    monkeypatch.setattr("engine.posterior.chain.learn_surrogate", counted)
-    target, done = Hills(), []
-    chain = run_chain(
-        target, Laplace(np.zeros(5), np.eye(5), 0.0, 1), walkers=12, max_steps=600, rng=np.random.default_rng(1),
-        progress=done.append,
-    )  # fmt: skip
-    assert len(known_before) >= 2
-    # What the chain went through is what the surrogate learns from.
-    assert known_before[1] > known_before[0] + 12 * 60
-    summary = chain.summary
-    assert summary.status == "converged"
-    # Steps before a restart are burn-in: all evaluations are accounted for, to half a step of all walkers.
-    assert abs(summary.evaluations - summary.walkers * (summary.steps + summary.burn_in)) <= summary.walkers / 2
-    x = chain.flat()[:, 0]
-    assert x.mean() == pytest.approx(
-        target.weight * target.away, abs=5 * x.std() / math.sqrt(summary.effective_samples)
-    )
-    assert all(0.0 < fraction <= 1.0 for fraction in done)
 
 
 def test_the_same_seed_gives_the_same_chain() -> None:

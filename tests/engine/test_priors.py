@@ -12,6 +12,8 @@ from engine import (
     Analysis,
     Host,
     Realization,
+    Reconstruction,
+    Simulation,
     SpecError,
     analyse,
     check_analysis,
@@ -151,23 +153,32 @@ def test_every_system_states_its_priors_and_they_hold_its_models(name: str) -> N
     assert {"theta_E", "q", "slope"} <= set(system.priors)
 
 
-def test_priors_and_positions_narrow_the_posterior() -> None:
-    simulation = simulate_realization(realization())
-    sd = {}
-    for name, asked in (
-        ("plain", {}),
-        ("told", {"priors": {"slope": ParameterPrior(mean=2.0, sd=0.002)}, "agn_position_sd": 0.002}),
-    ):
-        found = analyse(
-            simulation.observation,
-            realization(**asked, estimators=("paper",)).analysis,
-            np.random.default_rng(1),
-            agn_images=len(simulation.scene.agn),
-        )
-        sd[name] = {p.name: p.value.sd for p in found.lens}
-    assert sd["told"]["slope"] == pytest.approx(0.002, rel=0.4)
-    assert sd["told"]["slope"] < 0.5 * sd["plain"]["slope"]
-    assert sd["told"]["theta_E"] < sd["plain"]["theta_E"]
+def measured(simulation: Simulation, **asked: object) -> Reconstruction:
+    return analyse(
+        simulation.observation,
+        realization(**asked, draws=10, max_steps=60, estimators=("paper",)).analysis,
+        np.random.default_rng(1),
+        agn_images=len(simulation.scene.agn),
+    )
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    return simulate_realization(realization())
+
+
+@pytest.fixture(scope="module")
+def plain(simulation: Simulation) -> Reconstruction:
+    """Without priors, positions or a known background."""
+    return measured(simulation)
+
+
+def test_priors_and_positions_narrow_the_posterior(simulation: Simulation, plain: Reconstruction) -> None:
+    told = measured(simulation, priors={"slope": ParameterPrior(mean=2.0, sd=0.002)}, agn_position_sd=0.002)
+    without, sd = ({p.name: p.value.sd for p in found.lens} for found in (plain, told))
+    assert sd["slope"] == pytest.approx(0.002, rel=0.4)
+    assert sd["slope"] < 0.5 * without["slope"]
+    assert sd["theta_E"] < without["theta_E"]
 
 
 def test_a_run_takes_the_systems_priors_where_it_states_none() -> None:
@@ -177,16 +188,13 @@ def test_a_run_takes_the_systems_priors_where_it_states_none() -> None:
     assert analysis_of(realization()).priors == load_system(SYSTEM).priors
 
 
-def test_a_known_background_is_held_and_gives_the_host_its_wings_back() -> None:
+def test_a_known_background_is_held_and_gives_the_host_its_wings_back(
+    simulation: Simulation, plain: Reconstruction
+) -> None:
     """The simulation's sky is taken off exactly. A free background of the ring takes 0.3 mag of `paper`'s host."""
-    simulation = simulate_realization(realization())
     bias = {}
-    for name, sd in (("free", None), ("known", 1e-3)):
-        one = realization(background_sd=sd, draws=10, max_steps=60, estimators=("paper",))
-        found = analyse(
-            simulation.observation, one.analysis, np.random.default_rng(1), agn_images=len(simulation.scene.agn)
-        )
-        bias[name] = compare(found, one, simulation).estimate("paper", "wide").magnitude.bias
+    for name, found in (("free", plain), ("known", measured(simulation, background_sd=1e-3))):
+        bias[name] = compare(found, realization(), simulation).estimate("paper", "wide").magnitude.bias
     assert bias["free"] is not None
     assert bias["known"] is not None
     assert abs(bias["known"]) < 0.1 < bias["free"]

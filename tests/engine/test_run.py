@@ -22,14 +22,25 @@ from engine import (
     run,
 )
 from engine.figures import run_figure
+from engine.parametric.fit import ParametricFit
 from engine.result import INDEX_PRIORS
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import ESTIMATORS
 
 
 @pytest.fixture(scope="module")
-def result(realization: Realization) -> RunResult:
-    return run(realization)
+def stages_told() -> list[str]:
+    """Stages as the run of this module tells them."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def result(realization: Realization, stages_told: list[str]) -> RunResult:
+    def tell(stage: str, _: float) -> None:
+        if stage not in stages_told:
+            stages_told.append(stage)
+
+    return run(realization, tell)
 
 
 def test_a_run_reports_everything_finite(result: RunResult) -> None:
@@ -71,52 +82,47 @@ def test_the_host_and_its_surroundings_are_as_the_paper_defines_them(result: Run
 
 
 def test_even_a_coarse_reconstruction_finds_the_host(result: RunResult) -> None:
-    # 12 x 12 source pixels and ten steps: the estimators are within half a magnitude nonetheless.
-    assert abs(result.estimate("projected", "free").magnitude.bias or 9.0) < 0.5
-    assert abs(result.estimate("paper", "free").magnitude.bias or 9.0) < 0.7
-    # No grid to be coarse: what is left is the lens that the coarse grid finds.
-    assert abs(result.estimate("image", "wide").magnitude.bias or 9.0) < 0.15
+    image = result.estimate("image", "wide")
+    # No grid to be coarse: within 3.5 of its own deviations, and those are below 0.02 mag and 2 % at this brightness.
+    for quantity, most in ((image.magnitude, 0.02), (image.r_eff, 0.02 * 0.39), (image.n, 0.1)):
+        assert quantity.bias is not None
+        assert quantity.sd < most
+        assert abs(quantity.bias) < 3.5 * quantity.sd
+    # 12 x 12 cells of 0.12 arcsec; four draws. Measured at 21.5 mag and brighter: 0.05 mag, and 0.3 for the paper's.
+    assert result.estimate("projected", "free").magnitude.bias == pytest.approx(0.0, abs=0.1)
+    assert result.estimate("paper", "free").magnitude.bias == pytest.approx(0.2, abs=0.15)
 
 
-def test_the_same_realization_gives_the_same_bits(realization: Realization, result: RunResult) -> None:
-    again = run(realization)
-    assert again.estimates == result.estimates
-    assert again.lens == result.lens
-    assert again.products is not None
+def test_every_process_gives_the_same_bits_and_another_seed_others(realization: Realization, result: RunResult) -> None:
+    """Two workers beside each other, and the process of this test: three in all."""
+    from distributed import Client, LocalCluster
+
+    other = replace(realization, seed=1)
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
+        Client(cluster) as client,
+    ):
+        first, second = client.gather(client.map(run, [realization, other], pure=False))
+    assert first.estimates == result.estimates
+    assert first.lens == result.lens
+    assert second.estimates != result.estimates
+    assert first.products is not None
     assert result.products is not None
-    one, two = again.products.arrays(), result.products.arrays()
+    one, two = first.products.arrays(), result.products.arrays()
     assert one.keys() == two.keys()
     assert {"image", "residual", "source", "source_truth", "chain"} <= one.keys()
     for name, values in one.items():
         assert np.array_equal(values, two[name])
 
 
-def test_one_worker_and_two_give_the_same_bits(realization: Realization, result: RunResult) -> None:
-    from distributed import Client, LocalCluster
-
-    other = replace(realization, seed=1)
-    for workers in (1, 2):
-        with (
-            LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
-            Client(cluster) as client,
-        ):
-            futures = client.map(run, [realization, other], pure=False)
-            first, second = client.gather(futures)
-        assert first.estimates == result.estimates
-        assert first.lens == result.lens
-        assert second.estimates != result.estimates
-
-
-def test_progress_names_the_stages_in_order(realization: Realization) -> None:
-    seen: list[str] = []
-    run(realization, lambda stage, _: seen.append(stage) if stage not in seen else None)
-    assert seen == list(STAGES)
+def test_progress_names_the_stages_in_order(result: RunResult, stages_told: list[str]) -> None:
+    assert stages_told == [stage.stage for stage in result.stages] == list(STAGES)
 
 
 def test_an_analysis_is_blind_and_the_comparison_adds_the_truth_alone(
-    simulation: Simulation, realization: Realization
+    simulation: Simulation, realization: Realization, fit: ParametricFit
 ) -> None:
-    found = analyse(simulation.observation, realization.analysis, generator(realization, 1), agn_images=4)
+    found = analyse(simulation.observation, realization.analysis, generator(realization, 1), fit=fit)
     answered = [(e.estimator, e.index_prior) for e in found.estimates]
     assert answered == [(estimator, prior) for estimator in ESTIMATORS for prior in ("wide", "free")]
     assert all(estimate.magnitude.bias is None for estimate in found.estimates)
@@ -149,9 +155,11 @@ def test_image_alone_needs_no_chain_and_says_the_same(realization: Realization, 
     assert len(figure.axes) == 6
 
 
-def test_an_estimator_that_is_not_asked_for_has_no_answer(simulation: Simulation, realization: Realization) -> None:
+def test_an_estimator_that_is_not_asked_for_has_no_answer(
+    simulation: Simulation, realization: Realization, fit: ParametricFit
+) -> None:
     asked = replace(realization.analysis, estimators=("projected",))
-    found = analyse(simulation.observation, asked, generator(realization, 1), agn_images=4)
+    found = analyse(simulation.observation, asked, generator(realization, 1), fit=fit)
     assert {estimate.estimator for estimate in found.estimates} == {"projected"}
     assert found.inversion is not None
     # The aperture lies where `paper` puts it.
@@ -182,7 +190,7 @@ def test_a_system_of_ones_own_without_deflector_light_and_with_shear(realization
     shear = next(parameter for parameter in found.lens if parameter.name == "gamma1")
     # The catalogue's shear, found without having been told: within the coarse grid's model error.
     assert shear.value.mean == pytest.approx(0.040, abs=0.03)
-    assert abs(found.estimate("projected", "free").magnitude.bias or 9.0) < 0.6
+    assert found.estimate("projected", "free").magnitude.bias == pytest.approx(0.0, abs=0.15)
 
 
 def test_a_slope_without_a_mass_model_is_refused_by_field() -> None:

@@ -22,7 +22,7 @@ from engine.spec.realization import Realization
 from engine.spec.sky import Host
 
 SPEC = Realization(system="HE0435", l_eta=1.0, host=Host(n=4.0, r_eff=0.39, magnitude=20.5))
-DRAWS = 200
+DRAWS = 80
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +49,10 @@ def test_exposures_scatter_as_their_noise_map_says_from_empty_sky_to_the_agn_cor
         squares += np.bincount(classes.ravel(), residual**2, minlength=5)
     mean = sums / (counts * DRAWS)
     deviation = np.sqrt(squares / (counts * DRAWS) - mean**2)
-    # The smallest class, the cores, has 500 pixels x 200 draws: its mean is known to 0.003, its deviation to 0.002.
+    # The smallest class, the cores, has 500 pixels x 80 draws: its mean is known to 0.005, its deviation to 0.004.
     assert counts.min() >= 500
-    assert np.abs(mean).max() < 0.01
-    assert np.abs(deviation - 1).max() < 0.01
+    assert np.abs(mean).max() < 0.02
+    assert np.abs(deviation - 1).max() < 0.015
 
 
 def test_drizzled_noise_and_its_correlations_are_those_of_the_covariance_matrix(scene, light):
@@ -63,17 +63,17 @@ def test_drizzled_noise_and_its_correlations_are_those_of_the_covariance_matrix(
     index = np.arange(ny * nx).reshape(ny, nx)
     lags = {(0, 1): 0.0, (1, 0): 0.0, (1, 1): 0.0, (0, 2): 0.0}
     variance = np.zeros((ny, nx))
-    draws = 100
+    draws = 50
     for _ in range(draws):
         residual = drizzle(draw_noise(exposures.noise, rng), exposures.geometry) / observation.noise
         variance += residual**2
         for row, column in lags:
             lags[row, column] += np.mean(residual[row:, column:] * residual[: ny - row, : nx - column])
-    # 9,604 correlated pixels x 100 draws: the mean variance is known to 0.3 %, a correlation to 0.003.
-    assert variance.mean() / draws == pytest.approx(1, abs=0.01)
+    # 9,604 correlated pixels x 50 draws: the mean variance is known to 0.4 %, a correlation to 0.004.
+    assert variance.mean() / draws == pytest.approx(1, abs=0.015)
     sky = observation.noise < np.median(observation.noise)
-    assert variance[sky].mean() / draws == pytest.approx(1, abs=0.01)
-    assert variance[~sky].mean() / draws == pytest.approx(1, abs=0.01)
+    assert variance[sky].mean() / draws == pytest.approx(1, abs=0.015)
+    assert variance[~sky].mean() / draws == pytest.approx(1, abs=0.015)
     sigma = observation.noise.ravel()
     for (row, column), total in lags.items():
         here, there = index[row:, column:].ravel(), index[: ny - row, : nx - column].ravel()

@@ -47,14 +47,6 @@ def test_few_factorisations_find_the_strength_from_anywhere(away: float) -> None
     assert found.factorisations <= (9 if abs(away) <= 6 else 11)
 
 
-def test_strong_regularisation_leaves_the_evidence_of_no_source() -> None:
-    scene, model = Case(amplitudes=2), SourceModel((8, 8))
-    likelihood = scene.likelihood()
-    alone = -0.5 * likelihood.dd + likelihood.ln_constant
-    # D^T H^-1 D / 2 lambda and tr(H^-1 F) / 2 lambda are left.
-    assert ln_evidence(likelihood, LENS, 60.0, model) == pytest.approx(alone, abs=1e-6)
-
-
 def test_data_without_a_source_have_no_strength() -> None:
     scene, model = Case(amplitudes=0), SourceModel((9, 9))
     # Data half as noisy as their noise map says: the evidence rises until there is no source at all.

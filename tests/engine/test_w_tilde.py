@@ -103,6 +103,18 @@ def test_banded_noise_whitens_as_the_dense_factor_does() -> None:
         factorise_noise(np.array([[1.0, 2.0], [2.0, 1.0]]))
 
 
+def test_the_banded_factor_is_that_of_the_covariance_to_its_last_band() -> None:
+    rng = np.random.default_rng(7)
+    root = np.tril(np.triu(rng.normal(size=(30, 30)), -4))
+    root[np.diag_indices(30)] = rng.uniform(1.0, 2.0, 30)
+    noise = factorise_noise(sparse.csr_matrix(root @ root.T))
+    assert noise.bands.shape == (5, 30)
+    for offset in range(5):
+        assert np.allclose(noise.bands[offset, : 30 - offset], np.diag(root, -offset), atol=1e-12), offset
+    values = rng.normal(size=30)
+    assert np.allclose(noise.whiten(values), np.linalg.solve(root, values), atol=1e-10)
+
+
 def test_dark_pixels_without_any_response_are_no_obstacle() -> None:
     likelihood = ring_likelihood(0.0, 0)
     b = likelihood.blurring.toarray()

@@ -1,0 +1,205 @@
+"""Hosts and AGN that are hard to measure, through the whole of the engine: run, and the measurement of an image."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from engine import (
+    Analysis,
+    EngineError,
+    Host,
+    LensSystem,
+    PosteriorError,
+    Realization,
+    RunResult,
+    load_system,
+    measure_image,
+    run,
+    simulate_realization,
+)
+from engine.lensing.lens_equation import solve_lens_equation
+from engine.simulation.scene import power_law_lens
+from tests.hard_cases.test_lenses import fold_and_inward
+
+QUICK = Analysis(source_pixels=(12, 12), max_steps=10, draws=12)
+"""The chain is too short on purpose: what is tested does not depend on it."""
+
+
+def realization(system: str | LensSystem = "HE0435", magnitude: float = 20.5, r_eff: float = 0.39) -> Realization:
+    return Realization(system=system, l_eta=1.0, host=Host(n=2.0, r_eff=r_eff, magnitude=magnitude), analysis=QUICK)
+
+
+def assert_host_found(result: RunResult, deviations: float = 3.5) -> None:
+    """The image estimator, which has no grid, is at no bound and within its own errors of the truth."""
+    found = result.estimate("image", "wide")
+    assert found.at_bound == 0
+    assert found.magnitude.bias is not None
+    assert found.r_eff.bias is not None
+    assert abs(found.magnitude.bias) < deviations * found.magnitude.sd
+    assert abs(found.r_eff.bias) < deviations * found.r_eff.sd
+
+
+def everything_is_a_number(result: RunResult) -> bool:
+    names = ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y")
+    values = [getattr(e, name) for e in result.estimates for name in names]
+    return all(math.isfinite(v.mean) and math.isfinite(v.sd) for v in values)
+
+
+def test_a_host_fainter_than_the_noise_of_any_pixel_is_measured_within_its_errors() -> None:
+    """A host of 26 mag through `run`: its arc is nowhere as bright as the noise of one pixel.
+
+    Could go wrong: the fit follows the noise and states the error of a bright host. Holds: every number of the result
+    is finite; the image estimator is right to 3.5 of its own deviations, and says that it knows the magnitude to worse
+    than 0.15.
+    """
+    result = run(realization(magnitude=26.0))
+    assert everything_is_a_number(result)
+    assert result.products is not None
+    assert result.products.arc_model.max() < result.products.noise[result.products.mask].max()
+    assert_host_found(result)
+    assert result.estimate("image", "wide").magnitude.sd > 0.15
+
+
+def test_a_host_that_is_not_there_is_an_error_that_says_so() -> None:
+    """A host of 32 mag through `run`: a hundred times fainter than anything that the image could show.
+
+    Could go wrong: a magnitude of the noise is reported. Holds: a PosteriorError tells that
+    the data hold no source that stands out of the noise.
+    """
+    with pytest.raises(PosteriorError, match="stands out"):
+        run(realization(magnitude=32.0))
+
+
+@pytest.mark.long
+def test_a_host_below_the_noise_is_no_ok_of_the_measurement_of_an_image() -> None:
+    """A host of 28 mag in an image that is measured blindly.
+
+    Could go wrong: the profile collapses onto a bound and the status is `ok`. Holds: the status is not `ok`, or the
+    bound stands in the warnings, or an EngineError says what is missing.
+    """
+    observation = simulate_realization(realization(magnitude=28.0)).observation
+    try:
+        found = measure_image(observation, agn_images=4, shear=False, inversion=False)
+    except EngineError:
+        return
+    lost = abs(found.host.magnitude.mean - 28.0) > 3.0 * found.host.magnitude.sd
+    told = found.status != "ok" or any("bound" in warning for warning in found.warnings)
+    assert told or not lost
+
+
+def test_agn_seven_magnitudes_above_a_faint_host_leave_it_as_hs2209_does() -> None:
+    """HS2209 end to end: two AGN images of 16 mag over a host of 23, in UVIS.
+
+    Could go wrong: what the PSF leaves of the AGN is brighter than the host, and is fitted as the host. Holds: both
+    chi^2 and the image estimator are right: 0.9 to 1.1 per degree of freedom, and 3.5 of its own deviations.
+    """
+    result = run(realization("HS2209", magnitude=23.0))
+    assert everything_is_a_number(result)
+    assert result.agn_contrast is not None
+    assert result.agn_contrast < -4.0
+    assert result.chi2 / result.degrees_of_freedom == pytest.approx(1.0, abs=0.1)
+    assert_host_found(result)
+
+
+def test_a_host_as_large_as_half_the_ring_is_found() -> None:
+    """R_eff of half the Einstein radius: the host fills the ring and reaches beyond the source grid.
+
+    Could go wrong: its wings go into the deflector and the sky. Holds: the image estimator is right to 3.5 of its own
+    deviations and to 3 % in the radius; the estimators on source maps, which see the grid alone, call it too faint by
+    more than 0.2 mag, which is why they are not the ones to quote here.
+    """
+    result = run(realization(r_eff=0.608))
+    assert_host_found(result)
+    assert result.estimate("image", "wide").r_eff.bias == pytest.approx(0.0, abs=0.03 * 0.608)
+    assert result.estimate("paper", "wide").magnitude.bias > 0.2
+
+
+def test_a_host_whose_ring_is_cut_by_the_edge_of_the_field_is_found_from_what_is_left() -> None:
+    """A field of 3.2 arcsec round a ring of 2.4: the mask and the light of the arcs end at the edge of the image.
+
+    Could go wrong: pixels beyond the edge are taken for dark, or light that the PSF carries over it is lost. Holds: the
+    image estimator is right to 3.5 of its own deviations and the total magnitude to 0.1.
+    """
+    system = load_system("HE0435")
+    result = run(realization(replace(system, exposures=replace(system.exposures, field_pixels=40))))
+    assert result.products is not None
+    assert result.products.mask[0].any()
+    assert_host_found(result)
+    assert result.estimate("image", "wide").magnitude.bias == pytest.approx(0.0, abs=0.1)
+
+
+def test_a_field_that_cuts_an_agn_is_refused_and_not_fitted() -> None:
+    """A field of 2.56 arcsec, on whose edge the AGN images lie.
+
+    Could go wrong: a lens is fitted to two of the four images. Holds: an EngineError.
+    """
+    system = load_system("HE0435")
+    with pytest.raises(EngineError):
+        run(realization(replace(system, exposures=replace(system.exposures, field_pixels=32))))
+
+
+def close_pair(separation: float) -> LensSystem:
+    """HE0435 with its source so near a fold that two AGN images are as close as that [arcsec]."""
+    system = load_system("HE0435")
+    mass = system.mass_models["recommended"]["1.0"]
+    lens = power_law_lens(mass)
+    fold, inward = fold_and_inward(lens, lens.phi + 0.6)
+    low, high = 1e-8, 0.2
+    for _ in range(40):
+        distance = math.sqrt(low * high)
+        one, other, *_ = solve_lens_equation(lens, *(fold + distance * inward))
+        near = math.hypot(one.x - other.x, one.y - other.y) < separation
+        low, high = (distance, high) if near else (low, distance)
+    x, y = (float(v) for v in fold + low * inward)
+    images = solve_lens_equation(lens, x, y)
+    agn = tuple(
+        replace(known, name=name, position=(-image.x, image.y), magnitude=magnitude)
+        for known, name, image, magnitude in zip(system.agn, "ABCD", images, (19.0, 19.0, 20.0, 20.0), strict=True)
+    )
+    mass = replace(mass, source_position=(-x, y))
+    return replace(system, agn=agn, priors={}, mass_models={"recommended": {"1.0": mass}})
+
+
+@pytest.fixture(scope="module")
+def close() -> RunResult:
+    return run(realization(close_pair(0.05)))
+
+
+def test_agn_images_a_twentieth_of_an_arcsecond_apart_do_not_lead_the_host_astray(close: RunResult) -> None:
+    """Two AGN images 0.05 arcsec apart, less than a pixel of 0.08, and the observer told of four.
+
+    Could go wrong: the pair is one star for the search, a fourth is invented elsewhere, and the host makes up for it.
+    Holds: the image estimator is right to 0.05 mag, though chi^2 shows that the pair is not described.
+    """
+    assert close.estimate("image", "wide").magnitude.bias == pytest.approx(0.0, abs=0.05)
+    assert close.chi2 / close.degrees_of_freedom < 2.5
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="run has no status beside the chain's: a chi^2 of 1.9 per degree of freedom, where the pair of AGN is not "
+    "described, stands in the result without a warning",
+)
+def test_a_run_whose_model_does_not_describe_the_image_warns(close: RunResult) -> None:
+    """The same pair: chi^2 per degree of freedom is 1.9.
+
+    Could go wrong: a result that no model describes looks like any other. Holds: a warning names chi^2.
+    """
+    if close.chi2 / close.degrees_of_freedom < 1.5:
+        pytest.fail("the pair is described now: take another case")
+    assert any("chi2" in warning for warning in close.warnings)
+
+
+@pytest.mark.long
+def test_an_image_of_a_close_pair_that_is_taken_for_one_star_is_a_poor_fit() -> None:
+    """The same pair in an image measured blindly: three stars are found.
+
+    Could go wrong: the status is `ok`. Holds: `poor_fit`, with a warning that tells chi^2.
+    """
+    found = measure_image(simulate_realization(realization(close_pair(0.05))).observation, shear=False, inversion=False)
+    assert len(found.agn) == 3
+    assert found.status == "poor_fit"
+    assert any("chi2" in warning for warning in found.warnings)
+    assert np.isfinite(found.host.magnitude.mean)
