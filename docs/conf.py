@@ -26,7 +26,8 @@ myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 # At each build: what a cell shows is the engine's, whose changes no cache would see.
 nb_execution_mode = "force"
-nb_execution_timeout = 120
+# Of a cell; on a busy machine it is slow and not wrong.
+nb_execution_timeout = 1200
 nb_execution_raise_on_error = True
 nb_execution_show_tb = True
 

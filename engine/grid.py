@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import product
 from math import prod
@@ -89,19 +90,22 @@ def expand(grid: Grid) -> tuple[GridRun, ...]:
 class Expansion:
     """The runs of a grid in a fixed order: checked and counted at once, made one by one as they are asked for.
 
-    ``samples`` has one run of each system at each slope. What these and the values of the lists are refused for is all
-    that a run can be refused for, so neither time nor memory grows with the number of runs. A SpecError says which
-    value is not allowed and what is.
+    ``samples`` has one run of each system at each slope, ``shares`` how many of the runs each stands for. What these
+    and the values of the lists are refused for is all that a run can be refused for, so neither time nor memory grows
+    with the number of runs. A SpecError says which value is not allowed and what is.
     """
 
     def __init__(self, grid: Grid) -> None:
         _require_own_names(grid)
         self._grid = grid
         self._paper = None if grid.preset is None else _paper_points(grid)
-        samples = _samples(grid) if self._paper is None else self._paper
+        samples = list(_samples(grid)) if self._paper is None else self._paper
         by_setting = {(_name(system), l_eta): (system, number, host, l_eta) for system, number, host, l_eta in samples}
+        counts = Counter((_name(system), l_eta) for system, _, _, l_eta in samples)
         _require_known_parts(grid, list(by_setting.values()))
         self.samples = tuple(self._run(point, 0) for point in by_setting.values())
+        each = len(self) // len(samples)
+        self.shares = tuple(counts[setting] * each for setting in by_setting)
 
     def __len__(self) -> int:
         """How many runs there are."""

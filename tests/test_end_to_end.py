@@ -30,7 +30,7 @@ def test_a_grid_of_the_paper_survives_a_kill_and_its_biases_are_those_of_the_eng
         assert ended.counts.done == 4
         found = read_records(url, grid.id)
         assert (found.states, found.stored) == ({"done": 4}, 4)
-        summary = service.client.summary(grid.id)
+        summary = service.client.grid_summary(grid.id)
         runs = list(service.client.runs(grid.id))
         figures = [service.client.run(found.id).result for found in runs]
         assert all(found is not None and found.figure is not None for found in figures)

@@ -18,12 +18,15 @@ from service.api import (
     figures,
     grids,
     health,
+    login,
+    measurements,
     problems,
     results,
     run_files,
     site,
 )
 from service.api.context import Context, bind_ids
+from service.api.gate import COOKIE, Gate
 from service.api.limits import BodyLimit, known_parameters
 from service.api.methods import Head
 from service.api.metrics import Measured
@@ -34,6 +37,13 @@ from service.runtime.settings import Settings
 _PROBLEM: dict[str, Any] = {
     "description": "A problem (RFC 9457)",
     "content": {problems.MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
+}
+
+
+# Neither where the service listens on loopback: it asks for no token there unless told to.
+_SECURITY: dict[str, Any] = {
+    "token": {"type": "http", "scheme": "bearer", "description": "As hostlens token create makes it"},
+    "cookie": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "For pages: set by POST /login"},
 }
 
 
@@ -51,6 +61,8 @@ class _App(FastAPI):
             schemas |= schemas["Problem"].pop("$defs", {})
             schemas.pop("HTTPValidationError", None)
             schemas.pop("ValidationError", None)
+            document["components"]["securitySchemes"] = _SECURITY
+            document["security"] = [{}, *({name: []} for name in _SECURITY)]
             for operations in document["paths"].values():
                 for operation in operations.values():
                     operation["responses"].pop("422", None)
@@ -87,7 +99,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     app.state.context = context
-    app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes)
+    app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes, streamed=frozenset({measurements.ADDRESS}))
+    # Before the body is read: who may not come in sends none.
+    app.add_middleware(Gate, tokens=context.tokens if context.settings.asks_for_tokens else None)
     app.add_middleware(Head)
     # Last added is outermost: refused bodies are requests too.
     app.add_middleware(Measured, metrics=context.metrics)
@@ -95,7 +109,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
     figures.install(app)
-    for room in (grids, run_files, figures, results, exports, events, catalogue, health):
+    for room in (grids, run_files, figures, results, exports, measurements, events, catalogue, health, login):
         app.include_router(room.router)
     site.install(app)
     return app

@@ -33,15 +33,18 @@ class _ReadRequest(Request):
 
 
 class JsonRoute(Route):
-    """A route that takes a body only as JSON."""
+    """A route that takes a body only as JSON, and none at all where it need not have one."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         """FastAPI's own handler behind the reading of the body."""
         handle = super().get_route_handler()
         if self.body_field is None:
             return handle
+        is_required = self.body_field.field_info.is_required()
 
         async def read_and_handle(request: Request) -> Response:
+            if not is_required and not await request.body():
+                return await handle(_ReadRequest(request, b"", None))
             _require_json(request)
             body = await request.body()
             # Not here: a body of the largest size takes tenths of a second, in which nobody else would be served.

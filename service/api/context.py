@@ -13,10 +13,13 @@ from service.figures.kept import KeptFigures
 from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
+from service.store.costs import CostStore
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
+from service.store.measurements import MeasurementStore
 from service.store.outbox import EventStore
+from service.store.tokens import TokenStore
 
 _KEPT_BYTES = 32 * 2**20
 _IDS = frozenset({"grid_id", "run_id"})
@@ -29,7 +32,10 @@ class Context:
         self.settings = settings
         self.database = Database(settings.database)
         self.grids = GridStore(self.database)
+        self.costs = CostStore(self.database)
         self.events = EventStore(self.database)
+        self.measurements = MeasurementStore(self.database)
+        self.tokens = TokenStore(self.database)
         self.hub = Hub(self.events, settings.max_streams)
         # A connection of their own each time, or probes would queue behind whoever waits for the database already.
         self.probed = Database(settings.database, pooled=False)

@@ -6,6 +6,7 @@ import logging
 
 from fastapi import FastAPI, Request, Response
 
+from service.api.freshness import REVALIDATED, is_known, not_modified
 from service.api.problems import problem
 from service.store.artefacts import ArtefactDamagedError, ArtefactGoneError, ArtefactStore, ArtefactStoreError
 
@@ -15,10 +16,9 @@ _LOG = logging.getLogger(__name__)
 def artefact(store: ArtefactStore, key: str, media_type: str, if_none_match: str | None) -> Response:
     """An artefact, checked against its digest, or 304 where the client has it: what a key names never changes."""
     etag = f'"{key}"'
-    headers = {"ETag": etag}
-    if if_none_match is not None and etag in [tag.strip().removeprefix("W/") for tag in if_none_match.split(",")]:
-        return Response(status_code=304, headers=headers)
-    return Response(store.read(key), media_type=media_type, headers=headers)
+    if is_known(etag, if_none_match):
+        return not_modified(etag)
+    return Response(store.read(key), media_type=media_type, headers={"ETag": etag, **REVALIDATED})
 
 
 def install(app: FastAPI) -> None:

@@ -61,11 +61,12 @@ def _route(suffix: str, form: Format) -> Callable[..., Any]:
     async def export(service: Service, query: Annotated[ExportQuery, Query()]) -> Response:
         where, now = read_filter(query), utc_now()
         question = Question(where, given_filter(query), wanted_estimates(query), query.specs)
-        if not _places.acquire(blocking=False):
+        places = _places
+        if not places.acquire(blocking=False):
             raise HTTPException(503, f"{_AT_A_TIME} exports are being written already", headers={"Retry-After": "5"})
         spool = Spool(_LONGEST_S)
         writing = _EXPORTS.submit(spool.fill, partial(_write, service.database, question, form, now))
-        writing.add_done_callback(lambda _: _places.release())
+        writing.add_done_callback(lambda _: places.release())
         try:
             await spool.begun()
         except BaseException:

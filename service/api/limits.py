@@ -26,16 +26,17 @@ class BodyLimit:
     One whose body does not come to its announced end is dropped: half a body may well be a whole document.
 
     The body is read here, and given on whole: a limit that strikes while a handler reads would come out as whatever
-    error that handler makes of it.
+    error that handler makes of it. What is sent to a path of ``streamed`` has a handler that limits it itself.
     """
 
-    def __init__(self, app: ASGIApp, max_bytes: int) -> None:
+    def __init__(self, app: ASGIApp, max_bytes: int, streamed: frozenset[str] = frozenset()) -> None:
         self.app = app
         self.max_bytes = max_bytes
+        self._streamed = streamed
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
-        if scope["type"] != "http" or scope["method"] in {"GET", "HEAD", "OPTIONS"}:
+        if scope["type"] != "http" or scope["method"] in {"GET", "HEAD", "OPTIONS"} or scope["path"] in self._streamed:
             await self.app(scope, receive, send)
             return
         try:

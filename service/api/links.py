@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from service.domain.views import GridView, Links, RunView, SystemItem
+from service.domain.views import GridItem, GridView, Links, MeasurementView, RunItem, RunView, SystemItem
 
 _ACTIONS = ("cancel", "pause", "resume", "retry")
+_PARTS = ("figure", "products")
+"""What a run has addresses for where there is it."""
 _SystemT = TypeVar("_SystemT", bound=SystemItem)
 
 
@@ -28,6 +30,25 @@ def link_runs(runs: Sequence[RunView]) -> list[RunView]:
     return [run.model_copy(update={"links": _run_links(run.id, run.grid_id)}) for run in runs]
 
 
+def compact_grids(grids: Sequence[GridView]) -> list[GridItem]:
+    """Each in short."""
+    names = [name for name in GridItem.model_fields if name != "links"]
+    return [GridItem(**{name: getattr(one, name) for name in names}, links=link_grid(one).links) for one in grids]
+
+
+def link_run_items(runs: Sequence[RunItem]) -> list[RunItem]:
+    """Each with the addresses of what there is of it: the store says by a key in its place."""
+    return [
+        run.model_copy(
+            update={
+                "links": {"self": f"/v1/runs/{run.id}"}
+                | {part: f"/v1/runs/{run.id}/{part}" for part in _PARTS if part in run.links}
+            }
+        )
+        for run in runs
+    ]
+
+
 def link_document(document: dict[str, Any]) -> dict[str, Any]:
     """A run as plain data, with these addresses and those of the files that it has."""
     links = _run_links(document["id"], document["grid_id"])
@@ -42,6 +63,16 @@ def link_document(document: dict[str, Any]) -> dict[str, Any]:
 
 def _run_links(run_id: str, grid_id: str) -> Links:
     return {"self": f"/v1/runs/{run_id}", "grid": f"/v1/grids/{grid_id}"}
+
+
+def link_measurement(found: MeasurementView) -> MeasurementView:
+    """A measurement with its addresses, those of its grid and run, and of its figure where the store names one."""
+    own, grid = f"/v1/measurements/{found.id}", f"/v1/grids/{found.id}"
+    links = {"self": own, "grid": grid, "run": f"/v1/runs/{found.run_id}"}
+    links |= {name: f"{grid}/{name}" for name in ("events", *_ACTIONS)}
+    if "figure" in found.links:
+        links["figure"] = f"{own}/figure"
+    return found.model_copy(update={"links": links})
 
 
 def link_system(system: _SystemT) -> _SystemT:

@@ -17,6 +17,7 @@ from starlette.exceptions import HTTPException
 
 from engine import SpecError, complaint, field_path, path_steps, spec_error
 from service.api.methods import allowed_methods, options
+from service.domain.access import ForbiddenError
 from service.domain.requests import TooManyRunsError
 from service.domain.views import Place, Problem
 from service.store.database import AWAY
@@ -87,10 +88,11 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(TooManyRunsError, _too_many)
     app.add_exception_handler(NotFoundError, _not_found)
     app.add_exception_handler(KeyReusedError, _key_reused)
+    app.add_exception_handler(ForbiddenError, forbidden)
     app.add_exception_handler(SubmissionLostError, _lost)
     app.add_exception_handler(HTTPException, _http)
-    app.add_exception_handler(DBAPIError, _database)
-    app.add_exception_handler(PoolTimeoutError, _database)
+    app.add_exception_handler(DBAPIError, database_fault)
+    app.add_exception_handler(PoolTimeoutError, database_fault)
     app.add_exception_handler(SQLAlchemyError, _unexpected)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -156,6 +158,14 @@ def _not_found(request: Request, error: Exception) -> Response:
     return problem(request, 404, str(error))
 
 
+def forbidden(request: Request, error: Exception) -> Response:
+    """The answer to somebody who is known and may not do this."""
+    if not isinstance(error, ForbiddenError):  # pragma: no cover - registered for this type alone
+        raise error
+    challenge = f'Bearer realm="hostlens", error="insufficient_scope", scope="{error.scope}"'
+    return problem(request, 403, str(error), headers={"WWW-Authenticate": challenge})
+
+
 def _key_reused(request: Request, _: Exception) -> Response:
     message = "this Idempotency-Key was used for another request"
     place = Place.model_validate({"in": "header", "pointer": "idempotency-key", "message": message})
@@ -178,7 +188,8 @@ def _http(request: Request, error: Exception) -> Response:
     return problem(request, error.status_code, error.detail, headers=headers)
 
 
-def _database(request: Request, error: Exception) -> Response:
+def database_fault(request: Request, error: Exception) -> Response:
+    """The answer where the database raised an error."""
     # Programming errors and broken constraints are ours; everything else means that the database cannot serve now.
     if not isinstance(error, (*AWAY, PoolTimeoutError)):
         return _unexpected(request, error)

@@ -244,7 +244,8 @@ class Protocol(HttpToolsProtocol):
             self._refusal = error
 
     def _write_refusal(self, error: RefusedError) -> None:
-        answer = problem(None, error.status, str(error), headers={"Connection": "close"})
+        again = {"Retry-After": "5"} if error.status == 503 else {}
+        answer = problem(None, error.status, str(error), headers={"Connection": "close", **again})
         headers = (b"%s: %s\r\n" % header for header in (*self.server_state.default_headers, *answer.raw_headers))
         self.transport.write(b"".join((STATUS_LINE[error.status], *headers, b"\r\n", answer.body)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,26 +11,21 @@ import typer
 from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
-from service import VERSION
+import service
+from service.cli import grids, pictures
+from service.cli.connection import FailedError, console
+from service.cli.connection import settings as _settings
+from service.cli.figures import figures
 from service.cli.measuring import measure
-from service.cli.pictures import COMMANDS, named_or_read
 from service.cli.replay import replay
-from service.cli.request_file import read_request
+from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
 
 if TYPE_CHECKING:
     # What a command loads it loads itself: help and mistakes are told at once.
-    from rich.console import Console
-
-    from service.client import Client
-    from service.domain.views import GridView
     from service.runtime.settings import Settings
 
 _ARGUMENTS_WANTED = "NoArgsIsHelpError"
-
-
-class _FailedError(RuntimeError):
-    """What was asked for could not be done."""
 
 
 class _CommandLine(TyperGroup):
@@ -51,7 +45,7 @@ class _CommandLine(TyperGroup):
             self._refuse(error.format_message(), error.exit_code)
         except ConfigurationError as error:
             self._refuse(str(error), CONFIGURATION)
-        except (_FailedError, OSError, typer.Abort) as error:
+        except (FailedError, OSError, typer.Abort) as error:
             self._refuse(str(error) or "given up", 1)
         raise SystemExit(code if isinstance(code, int) else 0)
 
@@ -65,56 +59,19 @@ app = typer.Typer(
     cls=_CommandLine,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its boxes take as long to load as all the rest of the help
     help="How faithfully can the host galaxy of a lensed quasar be reconstructed?",
 )
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
-for command in (*COMMANDS, measure, replay):
+app.add_typer(tokens, name="token")
+for command in (*grids.COMMANDS, *pictures.COMMANDS, figures, measure, replay):
     app.command()(command)
-
-Url = Annotated[str | None, typer.Option("--url", envvar="HOSTLENS_URL", help="Address of the service")]
-Floats = Annotated[list[float] | None, typer.Option()]
-
-
-def _console() -> Console:
-    from rich.console import Console  # noqa: PLC0415 - as all that a command needs
-
-    return Console()
-
-
-def _settings(**changes: Any) -> Settings:
-    from service.runtime.settings import Settings, read_settings  # noqa: PLC0415 - as above
-
-    return read_settings(Settings, **changes)
-
-
-@contextmanager
-def _client(url: str | None) -> Iterator[Client]:
-    """A client of the service; where it is not served, the command ends with a line."""
-    import httpx  # noqa: PLC0415 - as above
-
-    from service.client import Client, ClientError, RequestError  # noqa: PLC0415 - as above
-
-    try:
-        with Client(_settings().url if url is None else url) as client:
-            yield client
-    except RequestError as error:
-        raise ConfigurationError(str(error)) from error
-    except ClientError as error:
-        raise _FailedError(str(error)) from error
-    except httpx.RequestError as error:
-        raise _FailedError(f"the service does not answer: {error}") from error
-
-
-def _tell(grid: GridView) -> None:
-    from service.cli.formatting import grid_line  # noqa: PLC0415 - as above
-
-    typer.echo(grid_line(grid))
 
 
 def _version(wanted: bool) -> None:
     if wanted:
-        typer.echo(VERSION)
+        typer.echo(service.VERSION)
         raise typer.Exit
 
 
@@ -189,111 +146,11 @@ def worker(
 def demo(
     data_dir: Annotated[Path, typer.Option(help="Folder of the demo's database and figures")] = Path("var/demo"),
 ) -> None:
-    """Four runs of HE0435-1223 through the whole system; exit code 0 only if all four were stored."""
+    """Four runs of HE0435-1223 through the whole system. Exit code 0 only if all four were stored."""
     from service.cli.demo import demo as run_demo  # noqa: PLC0415 - alembic takes a while, and status needs none
 
-    logging.getLogger("alembic").setLevel(logging.WARNING)
-    raise typer.Exit(run_demo(_settings(data_dir=data_dir), _console()))
-
-
-@app.command()
-def submit(
-    preset: Annotated[str | None, typer.Option(help="As h0licow-vi/HE0435")] = None,
-    system: Annotated[
-        list[str] | None, typer.Option(help="A name, or a TOML or JSON file; may be repeated, like the values below")
-    ] = None,
-    n: Floats = None,
-    r_eff: Floats = None,
-    magnitude: Floats = None,
-    l_eta: Floats = None,
-    seed: Annotated[int | None, typer.Option()] = None,
-    replicates: Annotated[int | None, typer.Option()] = None,
-    name: Annotated[str | None, typer.Option(help="For people")] = None,
-    file: Annotated[Path | None, typer.Option(help="A JSON body; options override it")] = None,
-    key: Annotated[str | None, typer.Option(help="Idempotency key")] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
-    url: Url = None,
-) -> None:
-    """Submit a grid."""
-    request = {} if file is None else read_request(file)
-    options = {
-        "preset": preset, "systems": [named_or_read(entry) for entry in system or []],
-        "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed,
-        "replicates": replicates, "name": name,
-    }  # fmt: skip
-    request |= {option: value for option, value in options.items() if value not in (None, [])}
-    with _client(url) as client:
-        grid = client.submit(request, key)
-        typer.echo(grid.id)
-        if watch:
-            _watch(client, grid.id)
-
-
-@app.command()
-def status(
-    grid: Annotated[str | None, typer.Argument(help="A grid; the newest ones without")] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Stay until the grid has ended")] = False,
-    runs: Annotated[bool, typer.Option("--runs", help="List the runs")] = False,
-    url: Url = None,
-) -> None:
-    """How far grids are."""
-    with _client(url) as client:
-        if grid is None:
-            for item in client.grids().items:
-                _tell(item)
-        elif watch:
-            _watch(client, grid)
-        elif runs:
-            from service.cli.formatting import runs_table  # noqa: PLC0415 - as above
-
-            _console().print(runs_table(client.runs(grid)))
-        else:
-            _tell(client.status(grid))
-
-
-@app.command()
-def results(
-    grid: Annotated[str, typer.Argument()],
-    as_json: Annotated[bool, typer.Option("--json", help="The summary as the API gives it")] = False,
-    url: Url = None,
-) -> None:
-    """Recovered values and biases of a grid."""
-    with _client(url) as client:
-        summary = client.summary(grid)
-        if as_json:
-            typer.echo(summary.model_dump_json(indent=2))
-        else:
-            from service.cli.formatting import summary_table  # noqa: PLC0415 - as above
-
-            _console().print(summary_table(summary))
-
-
-@app.command()
-def cancel(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
-    """Cancel a grid."""
-    with _client(url) as client:
-        _tell(client.cancel(grid))
-
-
-@app.command()
-def pause(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
-    """Start no further run of a grid for now; running ones go on to their end."""
-    with _client(url) as client:
-        _tell(client.pause(grid))
-
-
-@app.command()
-def resume(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
-    """Go on with a paused grid."""
-    with _client(url) as client:
-        _tell(client.resume(grid))
-
-
-@app.command()
-def retry(grid: Annotated[str, typer.Argument()], url: Url = None) -> None:
-    """Queue again what failed, was quarantined or was cancelled."""
-    with _client(url) as client:
-        _tell(client.retry(grid))
+    _silence_migrations()
+    raise typer.Exit(run_demo(_settings(data_dir=data_dir), console()))
 
 
 @app.command()
@@ -302,15 +159,15 @@ def check(
         str | None, typer.Option("--database", help="URL of an empty database; a SQLite file of its own without")
     ] = None,
 ) -> None:
-    """See whether this installation keeps its promise: processes are killed, each result is stored once; 2 minutes."""
+    """See whether this installation keeps its promise. Processes are killed, each result is stored once; 2 minutes."""
     from service.cli.check import check as carry_out  # noqa: PLC0415 - loads SQLAlchemy
     from service.runtime import preflight  # noqa: PLC0415 - as above
 
-    logging.getLogger("alembic").setLevel(logging.WARNING)
+    _silence_migrations()
     if database_url is not None:
         preflight.require_database(_settings(database_url=database_url))
     with _migrating():
-        code = carry_out(_console(), database_url)
+        code = carry_out(console(), database_url)
     raise typer.Exit(code)
 
 
@@ -361,8 +218,14 @@ def db_check() -> None:
     with _migrating():
         found = migrate.differences(_database_settings().database)
     if found is not None:
-        raise _FailedError(found)
+        raise FailedError(found)
     typer.echo("the database is what the code expects")
+
+
+def _silence_migrations() -> None:
+    import logging  # noqa: PLC0415 - help needs none
+
+    logging.getLogger("alembic").setLevel(logging.WARNING)
 
 
 def _require_revision(revision: str, other: str) -> None:
@@ -404,7 +267,7 @@ def db_prune(
     settings = _database_settings()
     preflight.require_artefacts(settings)
     with _migrating():
-        raise typer.Exit(pruning.prune(settings, age, _console(), dry_run=dry_run, ask=not yes))
+        raise typer.Exit(pruning.prune(settings, age, console(), dry_run=dry_run, ask=not yes))
 
 
 @contextmanager
@@ -415,21 +278,11 @@ def _migrating() -> Iterator[None]:
     from service.store.faults import AWAY, one_line  # noqa: PLC0415 - as above
     from service.store.migrate import MigrationError  # noqa: PLC0415 - as above
 
-    logging.getLogger("alembic").setLevel(logging.WARNING)
+    _silence_migrations()
     try:
         yield
     except MigrationError as error:
-        raise _FailedError(str(error)) from error
+        raise FailedError(str(error)) from error
     except DBAPIError as error:
         told = error if isinstance(error, AWAY) else one_line(error.orig or error)
-        raise _FailedError(f"the database refuses: {told}") from error
-
-
-def _watch(client: Client, grid_id: str) -> None:
-    from service.cli.watch import progress  # noqa: PLC0415 - as above
-
-    with progress(_console()) as show:
-        grid = client.wait(grid_id, show)
-    _tell(grid)
-    if grid.counts.done != grid.n_runs:
-        raise typer.Exit(1)
+        raise FailedError(f"the database refuses: {told}") from error

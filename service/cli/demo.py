@@ -70,7 +70,7 @@ def demo(settings: Settings, console: Console, timeout_s: float = 3600.0) -> int
 
 
 def _report(console: Console, client: Client, settings: Settings, grid: GridView) -> None:
-    console.print(summary_table(client.summary(grid.id)))
+    console.print(summary_table(client.grid_summary(grid.id)))
     artefacts = ArtefactStore(settings.artefacts)
     for run in client.runs(grid.id):
         found = client.run(run.id)

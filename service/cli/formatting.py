@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from rich.table import Table
 
 from service.domain.payload import EstimateName
-from service.domain.views import GridView, RunView, Summary, SummaryEstimate, SummaryValue
+from service.domain.views import DryRun, GridView, RunView, Summary, SummaryEstimate, SummaryValue
 
 _INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
 ROWS: tuple[tuple[EstimateName, str, str], ...] = (
@@ -22,6 +22,9 @@ ROWS: tuple[tuple[EstimateName, str, str], ...] = (
     ("paper_free", "n", "n (paper)"),
 )
 """What is shown of each input: by ``image`` with n in 0.3-8 where nothing is said, by ``paper`` with n in 1-4."""
+
+
+_SHOWN_LABELS = 10
 
 
 def value_of(estimate: SummaryEstimate, quantity: str) -> SummaryValue:
@@ -82,7 +85,18 @@ def grid_line(grid: GridView) -> str:
         parts.append(f"{60 * grid.rate_per_s:.2g} runs/min")
     if grid.eta_seconds and grid.finished_at is None:
         parts.append(f"{duration(grid.eta_seconds)} left")
-    return ", ".join(parts)
+    return ", ".join(parts) + ("" if grid.name is None else f" ({grid.name})")
+
+
+def dry_run_lines(found: DryRun) -> list[str]:
+    """What a request would start, the first runs by name."""
+    shown = found.labels[:_SHOWN_LABELS]
+    more = found.n_runs - len(shown)
+    return [
+        f"{found.n_runs} run{'' if found.n_runs == 1 else 's'}",
+        *shown,
+        *([f"... and {more} more"] if more else []),
+    ]
 
 
 def duration(seconds: float) -> str:

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
-from service.cli.outputs import FITS, PICTURES, require_apart, require_file
+from service.cli.outputs import FITS, PICTURES, require_apart, require_file, require_readable
 from service.cli.pictures import refusals
 
 if TYPE_CHECKING:
@@ -51,7 +50,7 @@ def measure(
     seed: Annotated[int, typer.Option(min=0, help="Of the chain")] = 0,
     inversion: Annotated[bool, typer.Option(help="Sample the inversion too; without it seconds")] = True,
 ) -> None:
-    """Measure the host galaxy in an image: magnitude, radius, index and their uncertainties."""
+    """Measure the host galaxy in an image. Its magnitude, radius and index, with their uncertainties."""
     if no_agn and (agn_images or positions):
         raise typer.BadParameter("--no-agn: there are --agn-images or --positions as well")
     outputs = [path for path in (json_file, figure, fits) if path is not None]
@@ -59,7 +58,10 @@ def measure(
     for path, kinds in ((json_file, ()), (figure, PICTURES), (fits, FITS)):
         if path is not None:
             require_file(path, kinds)
+    require_readable(path for path in (image, noise, psf, mask) if path is not None)
     with refusals():
+        from rich.console import Console  # noqa: PLC0415 - help needs none
+
         from engine import measure_image  # noqa: PLC0415 - the engine takes seconds to load
 
         observation = _observation(

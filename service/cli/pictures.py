@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from service.cli.outputs import PICTURES, require_file, require_folder
+from service.cli.outputs import PICTURES, as_file_name, require_file, require_folder, require_kind, require_readable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,7 +56,7 @@ def simulate(
     out: Out = Path(),
     all_runs: Annotated[bool, typer.Option("--all", help="The paper's 48 instead, as a montage")] = False,
 ) -> None:
-    """Simulate one realization: a FITS file, and a picture of its steps as in the paper's Fig. 1."""
+    """Simulate one realization. A FITS file, and a picture of its steps as in the paper's Fig. 1."""
     common = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
     if all_runs:
         if any(value is not None for value in (n, r_eff, magnitude, l_eta)) or defocus_nm or jitter:
@@ -67,6 +64,7 @@ def simulate(
         montage(system, **common, camera=camera, out=out)  # type: ignore[arg-type]
         return
     optics = {"defocus_nm": defocus_nm, "jitter": jitter} if defocus_nm or jitter else None
+    _require_files(system, camera)
     with refusals():
         realization = _realization(
             system,
@@ -85,7 +83,8 @@ def montage(
     camera: CameraOption = None,
     out: Out = Path(),
 ) -> None:
-    """Picture the 48 realizations of a system, numbered as in the paper's Table 3."""
+    """Picture the 48 realizations of a system. They are numbered as in the paper's Table 3."""
+    _require_files(camera)
     with refusals():
         from engine import Grid, expand, simulate_realization  # noqa: PLC0415
         from engine.figures import montage_figure  # noqa: PLC0415
@@ -107,7 +106,7 @@ def gallery(
     noise_level: NoiseOption = "author",
     out: Out = Path(),
 ) -> None:
-    """Picture the eight systems side by side, each with its lensed host alone."""
+    """Picture the eight systems side by side. Each also with its lensed host alone."""
     with refusals():
         from engine import Grid, expand, simulate_realization  # noqa: PLC0415
         from engine.figures import gallery_figure  # noqa: PLC0415
@@ -137,17 +136,20 @@ def inversion(
     camera: CameraOption = None,
     out: Annotated[Path | None, typer.Option(help="The picture; SYSTEM_inversion.png without")] = None,
 ) -> None:
-    """Picture one inversion: data, model, residual, source and its resolution, ln Z along each lens parameter."""
+    """Picture one inversion. Data, model, residual, source and its resolution, ln Z along each lens parameter."""
     grid = {} if source_pixels is None else {"source_pixels": (source_pixels, source_pixels)}
     common = {
         "seed": seed, "noise_level": noise_level, "mass_model": mass_model, "analysis": {"profile": profile, **grid},
     }  # fmt: skip
+    _require_files(system, camera)
+    if out is not None:
+        require_kind(out, PICTURES)
     with refusals():
         from engine import inspect_simulation, simulate_realization  # noqa: PLC0415
         from engine.figures import inversion_figure  # noqa: PLC0415
 
         realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
-        path = out or Path(f"{_as_file(realization.system_name)}_inversion.png")
+        path = out or Path(f"{as_file_name(realization.system_name)}_inversion.png")
         require_folder(path.parent)
         require_file(path, PICTURES)
         with _progress(f"inverting {realization.system_name}", 3) as advance:
@@ -192,14 +194,9 @@ def _paper_values(system: str) -> dict[str, float | None]:
     return {"r_eff": min(host.r_eff for host in hosts), "magnitude": sorted({host.magnitude for host in hosts})[1]}
 
 
-def named_or_read(system: str) -> str | dict[str, Any]:
-    """A system for a request: the name as it is, a file as the table that it holds."""
-    if not system.lower().endswith(_FILES):
-        return system
-    with refusals():
-        from engine import read_mapping  # noqa: PLC0415
-
-        return read_mapping(system)
+def _require_files(*choices: str | None) -> None:
+    """Systems and cameras that are files: there, and readable."""
+    require_readable(Path(choice) for choice in choices if choice is not None and choice.lower().endswith(_FILES))
 
 
 def _camera(choice: str | None) -> str | Camera | None:
@@ -229,7 +226,7 @@ def _write_one(realization: Realization, out: Path) -> None:
     host = realization.host
     # The digest in the name: another seed or camera is another file, and the same command writes the same one again.
     stem = (
-        f"{_as_file(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
+        f"{as_file_name(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
         f"_{realization.digest[:8]}"
     )
     require_folder(out)
@@ -247,11 +244,6 @@ def _write_one(realization: Realization, out: Path) -> None:
         typer.echo(f"the camera has no noise level {record['NOISEREQ']!r}: {record['NOISE']!r} was used", err=True)
 
 
-def _as_file(name: str) -> str:
-    """The name of a system of anybody's, without what a file cannot be called."""
-    return re.sub(r"[^\w.+-]", "_", name)[:80]
-
-
 def _save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=_DPI)
     typer.echo(path)
@@ -259,6 +251,16 @@ def _save(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def _progress(what: str, steps: int) -> Iterator[Any]:
+    from rich.console import Console  # noqa: PLC0415 - as the engine
+    from rich.progress import (  # noqa: PLC0415 - as above
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     columns: Sequence[Any] = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip

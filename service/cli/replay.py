@@ -106,7 +106,7 @@ def _compute(spec: dict[str, Any]) -> tuple[ResultPayload, dict[str, str]]:
 def _of_record(file: Path, run: str | None) -> OnRecord:
     from service.exports.record import FORMAT  # noqa: PLC0415 - takes a while
 
-    document = read_request(file)
+    document = read_request(file, "FILE")
     if document.get("format") != FORMAT:
         raise typer.BadParameter(f"{file}: format is {document.get('format')!r}, allowed is {FORMAT!r}")
     if run not in (None, document["run_id"]):

@@ -19,7 +19,7 @@ from typing import IO
 
 from service.dispatcher.outcomes import lost_artefact, refused_artefact
 from service.dispatcher.telemetry import DispatcherMetrics
-from service.domain.payload import ResultPayload
+from service.domain.payload import Payload
 from service.store.artefacts import ArtefactStore, ArtefactStoreError
 from service.store.leases import Lease
 from service.store.queue import Failure
@@ -66,7 +66,7 @@ class Backlog:
         """Of the results that wait."""
         return [held.lease for held in self._held]
 
-    def add(self, lease: Lease, payload: ResultPayload, artefacts: dict[str, bytes]) -> None:
+    def add(self, lease: Lease, payload: Payload, artefacts: dict[str, bytes]) -> None:
         """Keep a result until the store has taken its artefacts; NoRoomError where there are too many."""
         held = _Held(lease, payload, {})
         try:
@@ -88,7 +88,7 @@ class Backlog:
             self._drop(held)
         return [held.lease for held in taken]
 
-    def attend(self) -> list[tuple[Lease, ResultPayload | Failure]]:
+    def attend(self) -> list[tuple[Lease, Payload | Failure]]:
         """Try the store if it is time to; what waits no more: results that can be stored, or why one cannot.
 
         Nothing waits for ever behind an artefact that is refused for what it is: others go by it.
@@ -100,7 +100,7 @@ class Backlog:
             self._next = now + _LOOK_S
             self._ask()
             return []
-        ended: list[tuple[Lease, ResultPayload | Failure]] = []
+        ended: list[tuple[Lease, Payload | Failure]] = []
         for held in list(self._held):
             if held.due > now:
                 continue
@@ -116,7 +116,7 @@ class Backlog:
         self._next = min((held.due for held in self._held), default=now + _LOOK_S)
         return ended
 
-    def _try(self, held: _Held) -> ResultPayload | Failure | None:
+    def _try(self, held: _Held) -> Payload | Failure | None:
         """Put the artefacts of one result into the store; None where it has to wait."""
         try:
             for key, piece in list(held.pieces.items()):
@@ -168,7 +168,7 @@ class Backlog:
 @dataclass
 class _Held:
     lease: Lease
-    payload: ResultPayload
+    payload: Payload
     pieces: dict[str, _Piece]
     refusals: int = 0
     due: float = 0.0

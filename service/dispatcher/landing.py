@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from service.dispatcher.backlog import Backlog, NoRoomError
 from service.dispatcher.outcomes import OtherEngine, judge_answer, read_artefacts, read_exception
 from service.dispatcher.writer import Writer
-from service.domain.payload import ResultPayload
+from service.domain.payload import Payload
 from service.runtime import logs
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
@@ -35,7 +35,7 @@ class Landing:
 
     def attend(self) -> None:
         """Turn results that wait no more for the artefact store into endings."""
-        results: list[tuple[Lease, ResultPayload]] = []
+        results: list[tuple[Lease, Payload]] = []
         for lease, ending in self._backlog.attend():
             if isinstance(ending, Failure):
                 self._fail(lease, ending)
@@ -43,13 +43,13 @@ class Landing:
                 results.append((lease, ending))
         self._endings.store(results)
 
-    def _result(self, lease: Lease, said: Answer | BaseException) -> ResultPayload | None:
+    def _result(self, lease: Lease, said: Answer | BaseException) -> Payload | None:
         """A result that can be stored; anything else is dealt with here."""
-        ending: ResultPayload | Failure | OtherEngine
+        ending: Payload | Failure | OtherEngine
         artefacts: dict[str, bytes] = {}
         try:
             ending = read_exception(said) if isinstance(said, BaseException) else judge_answer(lease, said.answer)
-            if isinstance(ending, ResultPayload) and isinstance(said, Answer):
+            if isinstance(ending, Payload) and isinstance(said, Answer):
                 artefacts = read_artefacts(ending, said.answer)
         except Exception as error:  # noqa: BLE001 - the answer came from another process and may be anything
             ending = read_exception(error)
@@ -70,7 +70,7 @@ class Landing:
         _LOG.warning("run %s, attempt %d: %s", lease.run_id, lease.attempt, failure.detail, extra=told)
         self._endings.fail(lease, failure)
 
-    def _keep(self, lease: Lease, payload: ResultPayload, artefacts: dict[str, bytes]) -> None:
+    def _keep(self, lease: Lease, payload: Payload, artefacts: dict[str, bytes]) -> None:
         """Keep a result until the artefact store takes what came with it; without room for it the run goes back."""
         try:
             self._backlog.add(lease, payload, artefacts)

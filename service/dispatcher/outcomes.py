@@ -8,7 +8,8 @@ from base64 import b64decode
 from dataclasses import dataclass
 from typing import Any
 
-from service.domain.payload import InvalidResultError, ResultPayload, read_payload
+from service.domain.payload import InvalidResultError, Payload, read_measurement, read_payload
+from service.domain.plan import IMAGE
 from service.store.leases import Lease, Outcome
 from service.store.queue import Failure
 from service.worker.answers import NotPlainError
@@ -25,7 +26,7 @@ class OtherEngine:
     digest: str
 
 
-def judge_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEngine:
+def judge_answer(lease: Lease, answer: Any) -> Payload | Failure | OtherEngine:
     """What a worker's answer means for the run."""
     if not isinstance(answer, dict) or not {"payload", "error"} & set(answer):
         return _invalid("the worker's answer has neither a payload nor an error")
@@ -34,7 +35,7 @@ def judge_answer(lease: Lease, answer: Any) -> ResultPayload | Failure | OtherEn
     if lease.engine is not None and answer.get("engine") != lease.engine:
         return OtherEngine(clean(answer.get("engine"), 64))
     try:
-        payload = read_payload(answer["payload"])
+        payload: Payload = (read_measurement if lease.kind == IMAGE else read_payload)(answer["payload"])
     except InvalidResultError as error:
         return _invalid(str(error))
     if payload.realization_digest != lease.digest:
@@ -50,7 +51,7 @@ def _read_error(error: Any) -> Failure:
     return Failure(Outcome.ERROR, clean(error["code"], 64), clean(error.get("message", "")), retries)
 
 
-def read_artefacts(payload: ResultPayload, answer: dict[str, Any]) -> dict[str, bytes]:
+def read_artefacts(payload: Payload, answer: dict[str, Any]) -> dict[str, bytes]:
     """The artefacts of a payload that came home with it because the store did not take them, by their keys.
 
     Raises

@@ -21,6 +21,7 @@ from distributed.client import ClosedClientError
 from service.dispatcher.clusters import open_client
 from service.dispatcher.pickle_guard import read_error
 from service.dispatcher.stalls import LOOK_S, Asked, Condition, Stall, Stalls, WorkerMemory, read_conditions
+from service.domain.plan import IMAGE
 from service.runtime import logs
 from service.runtime.settings import Settings
 from service.store.leases import Lease
@@ -28,6 +29,8 @@ from service.worker.answers import NotPlainError, read_greeting
 from service.worker.tasks import answer_run, greet
 
 _LOG = logging.getLogger(__name__)
+MEASURE = "service.worker.measuring:measure"
+"""What a worker runs for an uploaded image, whatever it runs for a realization."""
 _STOP_S = 5.0
 _LOOK_EVERY_S, _LOOK_SOON_S = 0.5, 0.1
 _ASK_S = 10.0
@@ -129,7 +132,8 @@ class Pool:
     def submit(self, lease: Lease, worker: Worker) -> Any:
         """Start a run; the future of its answer."""
         fields = logs.fields_of(lease)
-        return self._on(worker.address, lease.key, answer_run, lease.spec, self._settings.artefacts, fields)
+        task = MEASURE if lease.kind == IMAGE else self._settings.task
+        return self._on(worker.address, lease.key, answer_run, task, lease.spec, self._settings.artefacts, fields)
 
     def stop(self, addresses: Iterable[str], futures: Iterable[Any] = ()) -> None:
         """Start workers anew, with whatever they are at: Dask cannot interrupt a task. Does not wait for it."""
@@ -184,7 +188,6 @@ class Pool:
         try:
             return self._client.submit(
                 function,
-                self._settings.task,
                 *arguments,
                 key=key,
                 workers=[address],
@@ -223,7 +226,7 @@ class Pool:
     def _greet(self, address: str, threads: int, now: float, passed: float) -> None:
         """Ask a new worker what it carries; until it has answered it gets no run, and if it does not it is replaced."""
         if address not in self._greetings:
-            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet), now)
+            self._greetings[address] = Asked(self._on(address, f"greet-{uuid4().hex}", greet, self._settings.task), now)
         asked = self._greetings[address]
         if not asked.future.done():
             if asked.has_stalled(self._conditions.get(address), passed, now):

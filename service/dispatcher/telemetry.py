@@ -17,7 +17,7 @@ from prometheus_client import (
 )
 
 from service.dispatcher.stalls import REASONS
-from service.domain.payload import ResultPayload
+from service.domain.payload import Payload
 from service.domain.states import RunState
 from service.runtime import logs
 from service.runtime.settings import Settings
@@ -130,7 +130,7 @@ class MeasuredQueue(RunQueue):
         self._metrics.claimed.inc(len(leases))
         return leases
 
-    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+    def store_all(self, results: Sequence[tuple[Lease, Payload]]) -> list[Stored]:
         """As the queue's."""
         with self._metrics.transaction("store"):
             outcomes = super().store_all(results)

@@ -10,7 +10,7 @@ from typing import Any
 
 from service.dispatcher.outcomes import unstorable
 from service.dispatcher.telemetry import DispatcherMetrics
-from service.domain.payload import ResultPayload
+from service.domain.payload import Payload
 from service.runtime import logs
 from service.store.faults import AWAY, StatementTooLongError
 from service.store.leases import Lease, Outcome
@@ -45,7 +45,7 @@ class Writer:
     def __len__(self) -> int:
         return len(self._line)
 
-    def store(self, results: Sequence[tuple[Lease, ResultPayload]]) -> None:
+    def store(self, results: Sequence[tuple[Lease, Payload]]) -> None:
         """Results to be stored, a thousand in one transaction."""
         for first in range(0, len(results), _STORE_AT_ONCE):
             some = list(results[first : first + _STORE_AT_ONCE])
@@ -118,7 +118,7 @@ class Writer:
         # Should that be refused too, the run stays as it is, and the next reconciliation finds a lease without a run.
         return [_Ending(lambda items: self._queue.set_aside(items[0][0], reason), [item], lambda _, __: [])]
 
-    def _store(self, results: list[tuple[Lease, ResultPayload]]) -> None:
+    def _store(self, results: list[tuple[Lease, Payload]]) -> None:
         for (lease, _), outcome in zip(results, self._queue.store_all(results), strict=True):
             if outcome is not Stored.STORED:
                 told = logs.fields_of(lease)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -48,6 +48,9 @@ def estimator_and_prior(name: str) -> tuple[str, str]:
 
 class InvalidResultError(ValueError):
     """A run ended with a result that must not be stored: a number is not finite, or a part is missing."""
+
+
+_PayloadT = TypeVar("_PayloadT", bound=BaseModel)
 
 
 class _Strict(BaseModel):
@@ -229,10 +232,51 @@ def result_payload(
     )
 
 
+class MeasurementPayload(_Strict):
+    """What was found in an uploaded image; ``document`` is the JSON that ``hostlens measure`` writes."""
+
+    realization_digest: Digest
+    """Of the run's specification."""
+    engine_digest: Digest
+    document: dict[str, Any]
+    wall_s: NonNegative
+    cpu_s: NonNegative
+    figure: ArtefactPayload | None = None
+
+    @model_validator(mode="after")
+    def _finite(self) -> MeasurementPayload:
+        json.dumps(self.document, allow_nan=False)
+        return self
+
+    @property
+    def products(self) -> None:
+        """Arrays are not kept."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what was found; the time that it took is left out."""
+        found = {name: value for name, value in self.document.items() if name not in {"seconds", "versions"}}
+        said = json.dumps([self.realization_digest, self.engine_digest, found], sort_keys=True)
+        return hashlib.sha256(said.encode()).hexdigest()
+
+
+Payload = ResultPayload | MeasurementPayload
+"""What a run of either kind brings home."""
+
+
+def read_measurement(document: object) -> MeasurementPayload:
+    """Validate the payload of a measurement, as :func:`read_payload`."""
+    return _read(MeasurementPayload, document)
+
+
 def read_payload(document: object) -> ResultPayload:
     """Validate a payload, wherever it comes from; an InvalidResultError names the first part that is wrong."""
+    return _read(ResultPayload, document)
+
+
+def _read(kind: type[_PayloadT], document: object) -> _PayloadT:
     try:
-        return ResultPayload.model_validate(document)
+        return kind.model_validate(document)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or "payload"

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
+
+IMAGE = "image"
+"""Kind of a run that measures an uploaded image."""
+
+
+class Kind(NamedTuple):
+    """What the time that a run takes depends on most."""
+
+    camera: str
+    configuration: str
+    profile: str
 
 
 @dataclass(frozen=True)

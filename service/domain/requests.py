@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -44,7 +45,7 @@ from engine import (
     system_facts,
     system_names,
 )
-from service.domain.plan import PlannedRun
+from service.domain.plan import Kind, PlannedRun
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
 
 CONFIGURATIONS = {2: "double", 4: "quad"}
@@ -118,6 +119,13 @@ class Plan:
     def __iter__(self) -> Iterator[PlannedRun]:
         """Make the runs, anew each time."""
         return map(_planned, self._runs)
+
+    def kinds(self) -> dict[Kind, int]:
+        """How many runs there are of each kind."""
+        counts: Counter[Kind] = Counter()
+        for sample, runs in zip(self._runs.samples, self._runs.shares, strict=True):
+            counts[_kind(sample.realization)] += runs
+        return dict(counts)
 
 
 def plan(request: GridRequest, max_runs: int) -> Plan:
@@ -198,13 +206,11 @@ def _grid(request: GridRequest) -> Grid:
 
 def _planned(run: GridRun) -> PlannedRun:
     realization = run.realization
-    system = realization.system
-    lens = load_system(system) if isinstance(system, str) else system
-    camera = realization.camera or lens.camera
+    kind = _kind(realization)
     inputs = {
         "system": realization.system_name,
-        "camera": camera if isinstance(camera, str) else camera.name,
-        "configuration": CONFIGURATIONS.get(len(lens.agn), "other"),
+        "camera": kind.camera,
+        "configuration": kind.configuration,
         "mass_model": realization.mass_model,
         "noise_level": realization.noise_level,
         "noise_treatment": realization.analysis.noise_treatment,
@@ -216,6 +222,17 @@ def _planned(run: GridRun) -> PlannedRun:
     }
     spec = realization.to_dict()
     return PlannedRun(run.label, run.paper_run, spec, inputs, spec_digest(spec))
+
+
+def _kind(realization: Realization) -> Kind:
+    system = realization.system
+    lens = load_system(system) if isinstance(system, str) else system
+    camera = realization.camera or lens.camera
+    return Kind(
+        camera=camera if isinstance(camera, str) else camera.name,
+        configuration=CONFIGURATIONS.get(len(lens.agn), "other"),
+        profile=realization.analysis.profile,
+    )
 
 
 def list_systems() -> list[SystemItem]:

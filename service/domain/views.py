@@ -85,14 +85,47 @@ class GridView(_Answer):
     rate_per_s: float | None
     """Runs that ended per second, over the latest hundred; None before the first."""
     eta_seconds: float | None
+    """Time left by the rate; before the first run has ended, by stored runs of its kind on the workers of now, and null
+    where there are none."""
     created_at: datetime
     finished_at: datetime | None
     cancelled_at: datetime | None
     paused_at: datetime | None
     engine_digest: str | None
     """Of the engine whose results the grid takes: the one that was installed where it was submitted."""
+    owner: str | None
+    """Name of the token that it was submitted with, who may cancel and retry it; null where none was asked for."""
     request: dict[str, Any]
     links: Links
+
+
+class GridItem(_Answer):
+    """A grid in short."""
+
+    id: str
+    name: str | None
+    owner: str | None
+    state: GridState
+    n_runs: int
+    progress: float
+    eta_seconds: float | None
+    created_at: datetime
+    finished_at: datetime | None
+    links: Links
+
+
+class CompactGridPage(_Answer):
+    """A page of grids in short, newest first."""
+
+    items: list[GridItem]
+    next: str | None
+
+
+class RetriedGrid(GridView):
+    """A grid some of whose runs have been queued again."""
+
+    retried: int
+    """How many; in a grid that is paused they wait with the others."""
 
 
 class GridPage(_Answer):
@@ -103,12 +136,43 @@ class GridPage(_Answer):
     """Address of the next page."""
 
 
+class Interval(_Answer):
+    """What is expected, and two standard deviations either way."""
+
+    low: float
+    expected: float
+    high: float
+
+
+class CostKind(_Answer):
+    """What the time that a run takes depends on most."""
+
+    camera: str
+    configuration: str
+    profile: str
+
+
+class Cost(_Answer):
+    """What runs should take, by stored runs of their kind (camera, configuration, profile)."""
+
+    cpu_s: Interval | None
+    """CPU of all runs together; null, as the next, where it is not known."""
+    wall_s: Interval | None
+    """On the workers that there are now, had they nothing else to do; null also where there are none."""
+    workers: int
+    stored_runs: int
+    """Stored runs that it is taken from."""
+    unknown: list[CostKind]
+    """Kinds with fewer than five stored runs: where there is one, nothing is known of the whole."""
+
+
 class DryRun(_Answer):
-    """What a request would start."""
+    """What a request would start, and what that would cost."""
 
     n_runs: int
     labels: list[str]
     """Labels of the first hundred runs."""
+    cost: Cost
 
 
 class RunError(_Answer):
@@ -135,6 +199,25 @@ class RunView(_Answer):
     error: RunError | None
     finished_at: datetime | None
     links: Links
+
+
+class RunItem(_Answer):
+    """A run in short."""
+
+    id: str
+    ordinal: int
+    label: str
+    state: RunState
+    error_code: str | None
+    finished_at: datetime | None
+    links: Links
+
+
+class CompactRunPage(_Answer):
+    """A page of a grid's runs in short."""
+
+    items: list[RunItem]
+    next: str | None
 
 
 class RunPage(_Answer):
@@ -265,6 +348,33 @@ class RunDetail(RunView):
     digest: str
     result: ResultView | None
     attempts: list[AttemptView]
+
+
+class MeasurementView(_Answer):
+    """An uploaded image, and what was found in it; the id is that of a grid of one run."""
+
+    id: str
+    run_id: str
+    name: str | None
+    owner: str | None
+    state: RunState
+    uws_phase: UwsPhase
+    error: RunError | None
+    created_at: datetime
+    finished_at: datetime | None
+    uploads: dict[str, str]
+    """Keys of the files in the artefact store."""
+    options: dict[str, Any]
+    measurement: dict[str, Any] | None
+    """The JSON that ``hostlens measure`` writes; null in lists, before the end, and once it was pruned."""
+    links: Links
+
+
+class MeasurementPage(_Answer):
+    """A page of measurements, newest first."""
+
+    items: list[MeasurementView]
+    next: str | None
 
 
 class RunRecord(_Answer):

@@ -100,7 +100,8 @@ class Installation:
         }
         # Closed with this process, however it ends: the service then ends too.
         self._pipe = os.pipe()
-        self.client = Client(f"http://127.0.0.1:{self.port}")
+        # Without repetitions: whoever looks for outages has to see each.
+        self.client = Client(f"http://127.0.0.1:{self.port}", retries=0)
         self.started = [self.start(*command) for command in commands]
 
     @property

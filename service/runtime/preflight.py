@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import importlib
 import importlib.util
+import logging
 import multiprocessing
 import os
 import shutil
@@ -25,7 +26,10 @@ import psutil
 from service.runtime.settings import Settings, bracketed
 from service.runtime.start import ConfigurationError
 from service.store.address import AddressError, SqliteAddress, read_address
+from service.store.database import AWAY, Database
+from service.store.tokens import TokenStore
 
+_LOG = logging.getLogger(__name__)
 API_PORT = "HOSTLENS_HOST and HOSTLENS_PORT"
 _EXTRAS = {"slurm": "dask_jobqueue.slurm", "kubernetes": "dask_kubernetes.operator"}
 _AWAY = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE})
@@ -139,12 +143,32 @@ def require_free(host: str, port: int, variables: str) -> None:
     listening(host, port, variables).close()
 
 
+def require_token(settings: Settings) -> None:
+    """Somebody can come in, where the API asks for tokens; not looked at while the database is away."""
+    if not settings.asks_for_tokens:
+        return
+    database = Database(settings.database, pooled=False)
+    try:
+        if TokenStore(database).any_valid():
+            return
+    except AWAY as error:
+        _LOG.warning("whether there is a token is not known: %s", error)
+        return
+    finally:
+        database.close()
+    raise ConfigurationError(
+        f"HOSTLENS_HOST: {settings.host} asks for tokens and there is none that is valid: make one with "
+        "hostlens token create NAME --scope admin, or set HOSTLENS_AUTH=off where a proxy or a firewall guards the API"
+    )
+
+
 def for_api(settings: Settings) -> None:
     """What one API process needs: of the data folder only what lies there."""
     if settings.database_url is None:
         require_data(settings)
     require_database(settings)
     require_artefacts(settings)
+    require_token(settings)
 
 
 def for_dispatcher(settings: Settings) -> None:

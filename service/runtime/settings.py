@@ -30,7 +30,7 @@ from service.runtime.setting_types import (
 from service.runtime.start import ConfigurationError
 
 _PREFIX = "HOSTLENS_"
-OTHERS = frozenset({"HOSTLENS_URL", PARENT_FD, LISTENER_FD, API_NUMBER})
+OTHERS = frozenset({"HOSTLENS_URL", "HOSTLENS_TOKEN", PARENT_FD, LISTENER_FD, API_NUMBER})
 """Variables that are no settings: of the command line's client, of the supervisor for its children."""
 DEPLOYMENT = frozenset(
     f"HOSTLENS_{name}" for name in ("DB_PASSWORD", "TAG", "SHARED", "SCHEDULER_HOST", "SCHEDULER_PORT")
@@ -75,9 +75,12 @@ class Settings(LogSettings):
 
     host: Host = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535)] = 8421
-    allow_remote: bool = False
-    """Let the API listen beyond loopback. There are no tokens yet: whoever reaches the port may submit."""
+    auth: Literal["off", "tokens"] | None = None
+    """Whether the API asks for tokens; where None, unless it listens on loopback. ``off`` elsewhere is for a proxy or a
+    firewall that asks who comes; ``tokens`` on loopback for a proxy that does not."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 1_000_000
+    max_upload_bytes: Annotated[int, Field(ge=10_000, le=2**33)] = 64_000_000
+    """Of the files of a measurement together."""
     max_grid_runs: Annotated[int, Field(ge=1, le=10_000_000)] = 100_000
     api_processes: Annotated[int, Field(ge=1, le=64)] = 2
     """API processes that ``hostlens serve`` starts on the one port; the three limits below hold in each."""
@@ -165,17 +168,17 @@ class Settings(LogSettings):
         encrypted = str(self.scheduler_address).startswith("tls://")
         if self.scheduler_address is not None and encrypted != (self.tls_ca is not None):
             raise ValueError("HOSTLENS_SCHEDULER_ADDRESS begins with tls:// where HOSTLENS_TLS_CA is set, only there")
-        if self.host not in LOOPBACK and not self.allow_remote:
-            raise ValueError(
-                f"HOSTLENS_HOST is {self.host}, which others can reach, and the API asks for no token: "
-                "set HOSTLENS_ALLOW_REMOTE=true if a proxy or a firewall guards it"
-            )
         return self
 
     @property
     def kind_of_cluster(self) -> ClusterKind:
         """Where the workers are."""
         return self.cluster or ("local" if self.scheduler_address is None else "address")
+
+    @property
+    def asks_for_tokens(self) -> bool:
+        """Whether the API lets in only who brings a token."""
+        return (self.auth or ("off" if self.host in LOOPBACK else "tokens")) == "tokens"
 
     @property
     def url(self) -> str:
@@ -245,5 +248,5 @@ def _require_known(settings: frozenset[str]) -> None:
             near = get_close_matches(name, known, 1, 0.75)
             hint = f": did you mean {near[0]}?" if near else "; docs/reference/settings.md lists them"
             raise ValueError(f"{variable} is not a setting of hostlens{hint}")
-        if name in settings | {"HOSTLENS_URL"} and not value.strip():
+        if name in settings | {"HOSTLENS_URL", "HOSTLENS_TOKEN"} and not value.strip():
             raise ValueError(f"{variable} is empty: give it a value, or unset it for the default")

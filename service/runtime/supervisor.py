@@ -87,6 +87,7 @@ class Supervisor:
         """
         preflight.for_both(self._settings)
         upgrade(self._settings.database)
+        preflight.require_token(self._settings)
 
     def run(self, stop: Event, serves: Callable[[], None] = lambda: None) -> int:
         """Start the processes and keep them running until ``stop`` is set; none is left afterwards.

@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, Connection, Select, and_, func, literal_co
 
 from service.domain.states import RunState
 from service.store.numbers import read_numbers
-from service.store.result_filter import AXES, ResultFilter
+from service.store.result_filter import AXES, ResultFilter, axes_of_run
 from service.store.statistics import FloatArray, IntArray, Moments, Share, moments, share
 from service.store.tables import estimate, grid, input_group, result, run
 
@@ -161,7 +161,7 @@ def failures_by_group(connection: Connection, where: ResultFilter, groups: Group
     counted = np.zeros(len(groups.values), dtype=np.intp)
     elsewhere = 0
     for grid_id, inputs, profile, regularisation, engine in connection.execute(failed):
-        known = {**inputs, "grid": grid_id, "profile": profile, "regularisation": regularisation, "engine": engine}
+        known = axes_of_run(inputs, grid_id, profile, regularisation, engine)
         if where.accepts(known):
             place = places.get(tuple(known[axis] for axis in groups.axes))
             if place is None:

@@ -26,11 +26,12 @@ from sqlalchemy.exc import IntegrityError
 from service.domain.identifiers import utc_now
 from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
-from service.domain.views import GridPage, GridView, RunDetail, RunPage
+from service.domain.views import CompactRunPage, GridPage, GridView, RunDetail, RunPage
 from service.store.database import Database
+from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent, recent_of
-from service.store.pieces import Turns
+from service.store.pieces import PIECE, Turns
 from service.store.rows import (
     ATTEMPT_COLUMNS,
     ESTIMATE_COLUMNS,
@@ -38,15 +39,18 @@ from service.store.rows import (
     ended_grid_view,
     grid_view,
     run_document,
+    run_item,
     run_view,
 )
-from service.store.settling import IS_OPEN, settle
+from service.store.run_filter import RunFilter
+from service.store.settling import IS_OPEN, revive_runs, settle
 from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
 from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
 
 WHOLE = grid.c.storing == false()
 """What anybody may see: all but what is being stored."""
+_REOPENED = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
 _BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
 
 
@@ -66,6 +70,17 @@ _COUNTS = (
     .group_by(run.c.grid_id, run.c.state)
 )
 _RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
+_RUN_VERSION = (
+    select(
+        *(run.c[name] for name in ("state", "attempt", "suspect", "finished_at", "error_code", "error_detail")),
+        # They may be pruned.
+        select(func.count()).where(attempt.c.run_id == run.c.id).correlate(run).scalar_subquery(),
+        *(result.c[name] for name in ("payload_digest", "stored_at", "figure", "products")),
+    )
+    .join(grid, grid.c.id == run.c.grid_id)
+    .outerjoin(result, result.c.run_id == run.c.id)
+    .where(run.c.id == bindparam("wanted"), WHOLE)
+)
 _RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
 _ESTIMATES = select(*ESTIMATE_COLUMNS).where(estimate.c.run_id == bindparam("wanted"))
 _ATTEMPTS = select(*ATTEMPT_COLUMNS).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
@@ -101,12 +116,16 @@ class GridStore:
         name: str | None = None,
         key: str | None = None,
         engine: str | None = None,
+        owner: str | None = None,
+        expected_wall_s: Callable[[], float | None] = lambda: None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
         After a crash there is the whole grid or none of it: what has been stored in part nobody sees, and it is gone on
         with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
-        ``engine`` is the digest of the engine whose results the grid takes, any where None.
+        ``engine`` is the digest of the engine whose results the grid takes, any where None; a key is its
+        ``owner``'s: of another one it is another request. ``expected_wall_s`` is what its runs should take on one
+        worker, asked as ``plan`` is.
 
         Raises
         ------
@@ -115,7 +134,8 @@ class GridStore:
         SubmissionLostError
             Storing took so long that the grid was given up.
         """
-        canonical = hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+        asked = request if owner is None else [owner, request]
+        canonical = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
         known = self._by_key(key, canonical)
         if known is not None and not known.storing:
             return Created(self.grid(known.id), replayed=True)
@@ -125,8 +145,9 @@ class GridStore:
             with self._database.write() as connection:
                 give_up(connection, known.id, self._clock())
             known = None
-        new = Submission(request, canonical, name, key, engine, self._clock())
+        new = Submission(request, canonical, name, key, engine, self._clock(), owner)
         if known is None:
+            new = replace(new, expected_wall_s=expected_wall_s())
             try:
                 return Created(self.grid(store(self._database, new, runs)), replayed=False)
             except IntegrityError:
@@ -158,9 +179,13 @@ class GridStore:
         with self._database.read() as connection:
             return summarise(connection, self._grid(connection, grid_id), limit, offset)
 
-    def grids(self, limit: int, before: str | None = None) -> GridPage:
-        """A page of grids, newest first, all from one picture of the database; ``next`` holds the cursor."""
-        wanted = select(grid).where(WHOLE).order_by(grid.c.id.desc()).limit(limit + 1)
+    def grids(self, limit: int, before: str | None = None, *, with_requests: bool = True) -> GridPage:
+        """A page of grids, newest first, all from one picture of the database; ``next`` holds the cursor.
+
+        Without their requests, which may have a megabyte each, that of every grid is empty.
+        """
+        columns = [column for column in grid.c if with_requests or column is not grid.c.request]
+        wanted = select(*columns).where(WHOLE).order_by(grid.c.id.desc()).limit(limit + 1)
         if before is not None:
             wanted = wanted.where(grid.c.id < before)
         with self._database.read() as connection:
@@ -179,6 +204,27 @@ class GridStore:
         items = [run_view(row) for row in rows[:limit]]
         return RunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
 
+    def run_items(self, grid_id: str, limit: int, after: int = -1, state: RunState | None = None) -> CompactRunPage:
+        """A page of a grid's runs in short; ``links`` of each has the keys of its artefacts."""
+        columns = (run.c.id, run.c.ordinal, run.c.label, run.c.state, run.c.error_code, run.c.finished_at)
+        wanted = select(*columns, result.c.figure, result.c.products).outerjoin(result, result.c.run_id == run.c.id)
+        wanted = wanted.where(run.c.grid_id == grid_id, run.c.ordinal > after)
+        if state is not None:
+            wanted = wanted.where(run.c.state == state)
+        with self._database.read() as connection:
+            self._require(connection, grid_id)
+            rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
+        items = [run_item(row) for row in rows[:limit]]
+        return CompactRunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
+
+    def run_version(self, wanted: str) -> tuple[Any, ...]:
+        """What changes whenever a run's document does, without reading that."""
+        with self._database.read() as connection:
+            row = connection.execute(_RUN_VERSION, {"wanted": wanted}).one_or_none()
+        if row is None:
+            raise NotFoundError(f"there is no run {wanted}")
+        return tuple(row)
+
     def run(self, wanted: str) -> RunDetail:
         """One run with result and attempts, checked."""
         return RunDetail.model_validate(self.run_document(wanted))
@@ -194,6 +240,15 @@ class GridStore:
             estimates = [] if found is None else connection.execute(_ESTIMATES, parameters).all()
             attempts = connection.execute(_ATTEMPTS, parameters).all()
         return run_document(row, found, estimates, attempts)
+
+    def owner(self, grid_id: str) -> str | None:
+        """Whose grid it is; a NotFoundError where there is none."""
+        with self._database.read() as connection:
+            row = connection.execute(select(grid.c.owner).where(grid.c.id == grid_id, WHOLE)).one_or_none()
+        if row is None:
+            raise NotFoundError(f"there is no grid {grid_id}")
+        owner: str | None = row.owner
+        return owner
 
     def cancel(self, grid_id: str) -> GridView:
         """Mark the grid, so that nothing of it is started and the dispatcher stops what is running; end what is queued.
@@ -236,12 +291,15 @@ class GridStore:
 
         return self._marked(grid_id, mark)
 
-    def revive(self, grid_id: str) -> int:
-        """Queue again every run of a grid that ended without a result; how many.
+    def revive(self, grid_id: str, wanted: RunFilter | None = None) -> int:
+        """Queue again the runs of a grid that ended without a result, all or those that are ``wanted``; how many.
 
         Earlier attempts stay on record but are no longer counted against the run. In a paused grid they wait with the
-        others.
+        others. Should this process die halfway through some that are wanted, the rest stays as it is until somebody
+        asks for the same again.
         """
+        if wanted is not None:
+            return self._revive_some(grid_id, wanted)
         now = self._clock()
         runs = 0
 
@@ -249,12 +307,31 @@ class GridStore:
             nonlocal runs
             runs = _count(connection, grid_id, REVIVE.sources)
             if runs:
-                values = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
-                connection.execute(update(grid).where(grid.c.id == grid_id).values(revive_from=0, **values))
+                connection.execute(update(grid).where(grid.c.id == grid_id).values(revive_from=0, **_REOPENED))
                 add_event(connection, grid_id, "grid_revived", now, runs=runs)
 
         self._marked(grid_id, mark)
         return runs
+
+    def _revive_some(self, grid_id: str, wanted: RunFilter) -> int:
+        with self._database.read() as connection:
+            self._require(connection, grid_id)
+            found = wanted.runs(connection, grid_id, REVIVE.sources)
+        revived = 0
+        for first in range(0, len(found), PIECE):
+            ids, now = found[first : first + PIECE], self._clock()
+
+            def mark(connection: Connection, ids: Sequence[str] = ids, now: datetime = now) -> None:
+                nonlocal revived
+                # Those that have ended without a result still: somebody else may have been faster.
+                runs = len(revive_runs(connection, run.c.id.in_(ids), now))
+                if runs:
+                    connection.execute(update(grid).where(grid.c.id == grid_id).values(**_REOPENED))
+                    add_event(connection, grid_id, "grid_revived", now, runs=runs)
+                revived += runs
+
+            self._marked(grid_id, mark)
+        return revived
 
     def _marked(self, grid_id: str, mark: Callable[[Connection], None]) -> GridView:
         """Set a mark and bring the runs to where it wants them, the first of them in the same transaction.
@@ -288,7 +365,9 @@ class GridStore:
         if row.ending is not None:
             return ended_grid_view(row)
         counts = {str(state): row._mapping[f"{state}_runs"] for state in RunState}
-        return grid_view(row, counts, recent_of(connection, grid_id), self._clock())
+        latest = recent_of(connection, grid_id)
+        workers = _workers(connection) if latest is None and row.expected_wall_s is not None else 0
+        return grid_view(row, counts, latest, self._clock(), workers)
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()
@@ -298,8 +377,11 @@ class GridStore:
         for row in connection.execute(_COUNTS, {"ids": ids}) if ids else ():
             counts[row.grid_id][row.state] = row.runs
         latest = recent(connection, ids) if ids else {}
+        workers = _workers(connection) if len(latest) < len(ids) else 0
         return [
-            grid_view(row, counts[row.id], latest.get(row.id), now) if row.ending is None else ended_grid_view(row)
+            grid_view(row, counts[row.id], latest.get(row.id), now, workers)
+            if row.ending is None
+            else ended_grid_view(row)
             for row in rows
         ]
 
@@ -307,6 +389,11 @@ class GridStore:
     def _require(connection: Connection, grid_id: str) -> None:
         if connection.scalar(select(grid.c.id).where(grid.c.id == grid_id, WHOLE)) is None:
             raise NotFoundError(f"there is no grid {grid_id}")
+
+
+def _workers(connection: Connection) -> int:
+    leader = leader_view(connection)
+    return 0 if leader is None else leader.workers
 
 
 def _count(connection: Connection, grid_id: str, states: Collection[RunState]) -> int:

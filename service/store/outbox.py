@@ -25,7 +25,7 @@ class EventStore:
 
     Whoever reads on from the last number that was seen misses nothing of what becomes of runs: all of that is written
     under the lock of the grid, so numbers are committed in their order. Only a ``stale_result``, which changes
-    nothing, may come in behind.
+    nothing, and a ``run_started``, whose run has still to end, may come in behind, and then be missed.
     """
 
     def __init__(self, database: Database) -> None:

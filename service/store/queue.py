@@ -27,7 +27,7 @@ from sqlalchemy import (
 )
 
 from service.domain.identifiers import new_token, utc_now
-from service.domain.payload import ResultPayload
+from service.domain.payload import MeasurementPayload, Payload, ResultPayload
 from service.domain.states import CANCEL_RUNNING, CLAIM, FAIL, FINISH, QUARANTINE, GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.database import Database
@@ -49,10 +49,10 @@ from service.store.leases import (
     requeue,
     set_aside,
 )
-from service.store.results import estimate_rows, result_row
+from service.store.results import estimate_rows, measurement_row, result_row
 from service.store.settling import held_grids
 from service.store.sums import add_to_inputs, add_to_moments
-from service.store.tables import attempt, estimate, grid, result, run
+from service.store.tables import attempt, estimate, grid, measurement, result, run
 from service.store.transitions import move, moving
 from service.store.upkeep import Upkeep
 
@@ -146,6 +146,10 @@ class RunQueue:
         with self._database.write() as connection:
             require_generation(connection, generation)
             rows = connection.execute(taken).all()
+            if rows:
+                # Without the lock of its grid, which nobody may wait for who holds runs.
+                started = [new_event(row.grid_id, "run_started", now, row.id, attempt=row.attempt) for row in rows]
+                add_events(connection, started)
         leases = []
         for row in sorted(rows, key=lambda row: (row.not_before, row.id)):
             spec = _read_spec(row.spec)
@@ -167,7 +171,7 @@ class RunQueue:
         _LOG.error("run %s fails: %s", lease.run_id, detail)
         self.fail(lease, Failure(Outcome.ERROR, "invalid_spec", detail, retries=0))
 
-    def store(self, lease: Lease, payload: ResultPayload) -> Stored:
+    def store(self, lease: Lease, payload: Payload) -> Stored:
         """Store a result if the lease is still valid.
 
         State, result, attempt and event change together: there is no moment at which a run is done without a result
@@ -176,7 +180,7 @@ class RunQueue:
         """
         return self.store_all([(lease, payload)])[0]
 
-    def store_all(self, results: Sequence[tuple[Lease, ResultPayload]]) -> list[Stored]:
+    def store_all(self, results: Sequence[tuple[Lease, Payload]]) -> list[Stored]:
         """Store several results as :meth:`store` does each, in one transaction: all of them are stored, or none.
 
         Short runs end faster than a disk can confirm one transaction each.
@@ -199,27 +203,19 @@ class RunQueue:
     def _finish(
         connection: Connection,
         rows: Sequence[LeasedRow],
-        results: Sequence[tuple[Lease, ResultPayload]],
+        results: Sequence[tuple[Lease, Payload]],
         now: datetime,
     ) -> None:
         """Move leased runs to done with their results; the caller holds the locks."""
         ids = [lease.run_id for lease, _ in results]
         end_attempts(connection, rows, Outcome.DONE, now)
         move(connection, FINISH, run.c.id.in_(ids), finished_at=now, error_code=None, error_detail=None)
-        asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
-        inputs = {row.id: row.inputs for row in asked}
-        stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
-        for row, input_id in zip(stored, add_to_inputs(connection, stored), strict=True):
-            row["input_id"] = input_id
-        answers = [
-            answer
-            for row, (lease, payload) in zip(stored, results, strict=True)
-            for answer in estimate_rows(lease.run_id, row["input_id"], payload)
-        ]
-        insert_rows(connection, result, stored)
-        if answers:
-            insert_rows(connection, estimate, answers)
-        add_to_moments(connection, stored, answers)
+        found = [(lease, payload) for lease, payload in results if isinstance(payload, ResultPayload)]
+        if found:
+            _insert_results(connection, found, now)
+        measured = [(lease, payload) for lease, payload in results if isinstance(payload, MeasurementPayload)]
+        if measured:
+            insert_rows(connection, measurement, [measurement_row(*one, now) for one in measured])
         add_events(
             connection,
             [new_event(lease.grid_id, "run_done", now, lease.run_id, attempt=lease.attempt) for lease, _ in results],
@@ -394,8 +390,9 @@ class RunQueue:
         return connection.scalar(counted) or 0
 
     @staticmethod
-    def _stale(connection: Connection, lease: Lease, payload: ResultPayload, now: datetime) -> Stored:
-        wanted = select(result.c.payload_digest).where(result.c.run_id == lease.run_id)
+    def _stale(connection: Connection, lease: Lease, payload: Payload, now: datetime) -> Stored:
+        table = measurement if isinstance(payload, MeasurementPayload) else result
+        wanted = select(table.c.payload_digest).where(table.c.run_id == lease.run_id)
         stored: Any = connection.scalar(wanted)
         same = stored is None or stored == payload.digest
         known = connection.scalar(select(grid.c.id).where(grid.c.id == lease.grid_id))
@@ -421,6 +418,25 @@ _CLAIMED = (
     run.c.not_before,
     _ENGINE.label("engine_digest"),
 )
+
+
+def _insert_results(connection: Connection, results: Sequence[tuple[Lease, ResultPayload]], now: datetime) -> None:
+    """Write results of realizations with all that is added up from them."""
+    ids = [lease.run_id for lease, _ in results]
+    asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
+    inputs = {row.id: row.inputs for row in asked}
+    stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
+    for row, input_id in zip(stored, add_to_inputs(connection, stored), strict=True):
+        row["input_id"] = input_id
+    answers = [
+        answer
+        for row, (lease, payload) in zip(stored, results, strict=True)
+        for answer in estimate_rows(lease.run_id, row["input_id"], payload)
+    ]
+    insert_rows(connection, result, stored)
+    if answers:
+        insert_rows(connection, estimate, answers)
+    add_to_moments(connection, stored, answers)
 
 
 def _read_spec(text: str) -> dict[str, Any] | None:

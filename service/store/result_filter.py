@@ -97,6 +97,13 @@ class ResultFilter:
         return all(any(_is(values[name], one) for one in wanted) for name, wanted in self.wanted.items())
 
 
+def axes_of_run(
+    inputs: Mapping[str, Any], grid_id: str, profile: str | None, regularisation: str | None, engine: str | None
+) -> dict[str, Any]:
+    """The axes of a run, whether it has a result or not."""
+    return {**inputs, "grid": grid_id, "profile": profile, "regularisation": regularisation, "engine": engine}
+
+
 def _read(axis: Axis, text: str) -> Wanted:
     if not axis.is_number:
         return None if text == NONE and axis.column.nullable else text

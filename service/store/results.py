@@ -15,6 +15,7 @@ from service.domain.payload import (
     QUANTITIES,
     AperturePayload,
     ChainPayload,
+    MeasurementPayload,
     ResultPayload,
     estimator_and_prior,
 )
@@ -90,6 +91,21 @@ def estimate_rows(run_id: str, input_id: int, payload: ResultPayload) -> list[di
             row[part] = getattr(found, part)
         rows.append(row)
     return rows
+
+
+def measurement_row(lease: Lease, payload: MeasurementPayload, now: datetime) -> dict[str, Any]:
+    """Typed columns of what was found."""
+    return {
+        "run_id": lease.run_id,
+        "stored_at": now,
+        "document": payload.document,
+        "payload_digest": payload.digest,
+        "engine_digest": payload.engine_digest,
+        "wall_s": payload.wall_s,
+        "cpu_s": payload.cpu_s,
+        "figure": payload.figure and payload.figure.key,
+        "figure_digest": payload.figure and payload.figure.digest,
+    }
 
 
 def _aperture_columns(found: AperturePayload | None) -> dict[str, Any]:

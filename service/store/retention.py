@@ -1,8 +1,9 @@
 """What may go of the rows that grow with time, and what is kept and why.
 
-Results, runs and grids stay. Events, attempts and idempotency keys go once their grid has ended before a certain time
-and they are older than it themselves: attempts of an open grid count against its runs, events of one are read on, and
-its key still has to find it. The newest event of each grid stays, so that numbers go on from it.
+Results, runs and grids stay. Events, attempts, idempotency keys and what was measured in uploaded images go once their
+grid has ended before a certain time and they are older than it themselves: attempts of an open grid count against its
+runs, events of one are read on, and its key still has to find it. The newest event of each grid stays, so that numbers
+go on from it.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, Select, Table, and_, case, delete, func, literal_column, select, tuple_
 
-from service.domain.states import RunState
+from service.domain.states import OPEN_STATES, RunState
 from service.store.database import Database
 from service.store.leases import lock_grids
 from service.store.pieces import PIECE, Turns
-from service.store.tables import attempt, event, grid, idempotency, result, run
+from service.store.tables import attempt, event, grid, idempotency, measurement, result, run
 
 OPEN, YOUNGER, NEWEST = "its grid is open", "younger", "newest of its grid, which streams resume from"
 _OLD = "old"
@@ -59,6 +60,13 @@ _KINDS = (
         (idempotency.c.key,),
         idempotency.c.created_at,
         idempotency.join(grid, grid.c.id == idempotency.c.grid_id),
+    ),
+    _Kind(
+        "measurements",
+        measurement,
+        (measurement.c.run_id,),
+        measurement.c.stored_at,
+        measurement.join(run, run.c.id == measurement.c.run_id).join(grid, grid.c.id == run.c.grid_id),
     ),
 )
 KINDS = tuple(kind.name for kind in _KINDS)
@@ -137,10 +145,17 @@ class Retention:
 
 
 def referred_artefacts(database: Database) -> set[str]:
-    """Keys of all artefacts that results refer to."""
+    """Keys of all artefacts that results, measurements and uploads that wait to be measured refer to."""
     with database.read() as connection:
         rows = connection.execution_options(yield_per=10_000).execute(select(result.c.figure, result.c.products))
-        return {key for row in rows for key in row if key is not None}
+        referred = {key for row in rows for key in row if key is not None}
+        # What was uploaded is kept as long as it may have to be measured, and then as what was found in it.
+        wanted = run.c.state.in_(sorted(OPEN_STATES)) | measurement.c.run_id.is_not(None)
+        source = run.outerjoin(measurement, measurement.c.run_id == run.c.id)
+        images = select(run.c.spec, measurement.c.figure).select_from(source)
+        for spec, figure in connection.execute(images.where(run.c.kind == literal_column("'image'"), wanted)):
+            referred |= {*spec["uploads"].values(), *([] if figure is None else [figure])}
+        return referred
 
 
 def oldest_lease(database: Database) -> datetime | None:

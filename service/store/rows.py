@@ -10,7 +10,7 @@ from sqlalchemy import Row, RowMapping
 
 from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload, estimator_and_prior
 from service.domain.states import GridState, RunState
-from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunView
+from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunItem, RunView
 from service.store.pace import Recent
 from service.store.tables import attempt, estimate, run
 
@@ -44,8 +44,13 @@ def ended_grid_view(row: Row[Any]) -> GridView:
     return _grid_view(row, RunCounts(**row.ending["counts"]), GridState(row.state), row.ending["rate_per_s"], 0.0)
 
 
-def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime) -> GridView:
-    """A grid with its progress; an unfinished one that is not paused is running once a run has been started."""
+def grid_view(
+    row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime, workers: int = 0
+) -> GridView:
+    """A grid with its progress; an unfinished one that is not paused is running once a run has been started.
+
+    ``workers`` that there are now: before the first run has ended the time left is that of stored runs of its kind.
+    """
     runs = RunCounts(**counts)
     state = GridState(row.state)
     if state is GridState.QUEUED and row.paused_at is not None:
@@ -54,6 +59,8 @@ def grid_view(row: Row[Any], counts: dict[str, int], recent: Recent | None, now:
         state = GridState.RUNNING
     remaining = runs.queued + runs.paused + runs.leased
     rate, left = _pace(recent, remaining, now)
+    if left is None and workers and row.expected_wall_s is not None:
+        left = row.expected_wall_s * remaining / row.n_runs / min(workers, remaining)
     if state is GridState.PAUSED:
         left = None
     return _grid_view(row, runs, state, rate, left)
@@ -75,7 +82,8 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         cancelled_at=row.cancelled_at,
         paused_at=row.paused_at,
         engine_digest=row.engine_digest,
-        request=row.request,
+        owner=row.owner,
+        request=row._mapping.get("request", {}),
         links={},
     )
 
@@ -94,6 +102,14 @@ def _pace(recent: Recent | None, remaining: int, now: datetime) -> tuple[float |
         rate = recent.rate(now)
         left = remaining / rate
     return rate, max(left, 0.0) if remaining else 0.0
+
+
+def run_item(row: Row[*tuple[Any, ...]]) -> RunItem:
+    """A run in short, with the keys of its artefacts in the place of their addresses."""
+    artefacts = {name: getattr(row, name) for name in ("figure", "products")}
+    names = [name for name in RunItem.model_fields if name != "links"]
+    kept = {name: key for name, key in artefacts.items() if key is not None}
+    return RunItem(**{name: getattr(row, name) for name in names}, links=kept)
 
 
 def run_view(row: Row[Any]) -> RunView:

@@ -42,7 +42,7 @@ def settle(connection: Connection, grid_id: str, now: datetime) -> bool:
     if marks.state != GridState.QUEUED:
         return False
     if marks.revive_from is not None:
-        _revive(connection, places(grid_id, marks.revive_from), now)
+        revive_runs(connection, places(grid_id, marks.revive_from), now)
         if marks.paused_at is not None:
             move(connection, PAUSE, places(grid_id, marks.revive_from))
         after = marks.revive_from + PIECE
@@ -59,9 +59,10 @@ def _wanted(cancelled_at: datetime | None, paused_at: datetime | None) -> Transi
     return CANCEL if cancelled_at is not None else RESUME if paused_at is None else PAUSE
 
 
-def _revive(connection: Connection, where: ColumnElement[bool], now: datetime) -> None:
+def revive_runs(connection: Connection, where: ColumnElement[bool], now: datetime) -> list[str]:
+    """Queue runs again that ended without a result, as if they had not been tried; the caller holds the grid's lock."""
     fresh = {"not_before": now, "charged_from": run.c.attempt, "finished_at": None, "suspect": False}
-    move(connection, REVIVE, where, error_code=None, error_detail=None, **fresh)
+    return move(connection, REVIVE, where, error_code=None, error_detail=None, **fresh)
 
 
 def _move(connection: Connection, grid_id: str, transition: Transition, now: datetime) -> bool:

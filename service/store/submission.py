@@ -40,6 +40,8 @@ class Submission:
     key: str | None
     engine: str | None
     created_at: datetime
+    owner: str | None = None
+    expected_wall_s: float | None = None
 
 
 def store(database: Database, submission: Submission, plan: Plan, begun: str | None = None) -> str:
@@ -95,6 +97,8 @@ def _begin(connection: Connection, grid_id: str, submission: Submission, n_runs:
             state=GridState.QUEUED,
             created_at=submission.created_at,
             engine_digest=submission.engine,
+            owner=submission.owner,
+            expected_wall_s=submission.expected_wall_s,
             storing=True,
         )
     )

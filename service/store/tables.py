@@ -30,7 +30,7 @@ from sqlalchemy.types import TypeEngine
 
 from service.domain.payload import COUNTS, LENS_PARAMETERS, QUANTITIES
 
-REVISION = "0008"
+REVISION = "0009"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -89,6 +89,10 @@ grid = Table(
     Column("revive_from", Integer),
     # What would otherwise be counted anew with every look; null as long as a run is open.
     Column("ending", JSON(none_as_null=True)),
+    # Name of the token that it was submitted with; null where none was asked for.
+    Column("owner", String(64)),
+    # What its runs should take on one worker, by stored runs of their kind [s]; null where there was none.
+    Column("expected_wall_s", Float),
     CheckConstraint("state in ('queued', 'done', 'failed', 'cancelled')", name="state"),
     # How many there are of each, without reading requests of up to a megabyte.
     Index("ix_grid_state_storing", "state", "storing"),
@@ -284,6 +288,24 @@ result = Table(
 )
 
 
+# What was found in uploaded images: until it is pruned.
+measurement = Table(
+    "measurement",
+    metadata,
+    Column("run_id", ForeignKey("run.id"), primary_key=True),
+    Column("stored_at", UtcDateTime, nullable=False),
+    Column("document", JSON, nullable=False),
+    Column("payload_digest", String(64), nullable=False),
+    Column("engine_digest", String(64), nullable=False),
+    Column("wall_s", Float, nullable=False),
+    Column("cpu_s", Float, nullable=False),
+    Column("figure", String(200)),
+    Column("figure_digest", String(64)),
+)
+# The runs that measure images, in the order of their grids: few among many.
+Index("ix_run_image", run.c.grid_id, sqlite_where=text("kind = 'image'"), postgresql_where=text("kind = 'image'"))
+
+
 def _quantity_columns() -> list[Column[Any]]:
     # All null where results are older than a quantity; the bias also where there is no truth.
     return [Column(f"{quantity}_{part}", Float) for quantity in QUANTITIES for part in ("mean", "sd", "bias")]
@@ -368,6 +390,20 @@ idempotency = Table(
     Column("request_digest", String(64), nullable=False),
     Column("grid_id", ForeignKey("grid.id"), nullable=False),
     Column("created_at", UtcDateTime, nullable=False),
+)
+
+# Who may come in. The token itself is known to its holder alone.
+token = Table(
+    "token",
+    metadata,
+    Column("id", String(12), primary_key=True),
+    Column("digest", String(64), nullable=False),
+    Column("name", String(64), nullable=False),
+    Column("scope", String(16), nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("expires_at", UtcDateTime),
+    Column("revoked_at", UtcDateTime),
+    CheckConstraint("scope in ('read', 'submit', 'admin')", name="scope"),
 )
 
 leader = Table(

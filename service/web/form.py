@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Kind = Literal["text", "number", "integer", "boolean", "list", "json"]
+_UNBOUNDED = 1e9
 _SCALARS: dict[str, Kind] = {"string": "text", "number": "number", "integer": "integer", "boolean": "boolean"}
 
 
@@ -22,6 +23,8 @@ class Field:
     options: tuple[str, ...] = ()
     items: Kind = "text"
     """What a list holds."""
+    is_long: bool = False
+    """It may hold an object of one's own."""
     value: str = ""
     error: str = ""
 
@@ -84,7 +87,21 @@ def _field(path: str, name: str, schema: Mapping[str, Any], default: Any) -> Fie
     blank = "" if default is None else str(default)
     if options:
         blank = f"default: {default}" if default is not None else "default"
-    return Field(path, name.replace("_", " "), kind, _hint(kind, schema), blank, options, items)
+    return Field(
+        path,
+        name.replace("_", " "),
+        kind,
+        _hint(kind, schema),
+        blank,
+        options,
+        items,
+        kind == "json" or _has_object(schema),
+    )
+
+
+def _has_object(schema: Mapping[str, Any]) -> bool:
+    choices = schema.get("items", schema).get("oneOf", ())
+    return any("$ref" in choice for choice in choices)
 
 
 def _kind(schema: Mapping[str, Any]) -> tuple[Kind, Kind]:
@@ -118,17 +135,16 @@ def _range(schema: Mapping[str, Any]) -> str:
     whole = "whole number" if schema.get("type") == "integer" else ""
     if low is None and high is None:
         return whole
-    bounds = (
-        f"{low:g} to {high:.6g}"
-        if high is not None and low is not None
-        else f"from {low if low is not None else high:g}"
-    )
-    return f"{whole} {bounds}".strip()
+    # What a number may be at all is no bound to tell of.
+    ends = [end for end in (low, high) if end is not None and abs(end) < _UNBOUNDED]
+    told = " to ".join(f"{end:g}" for end in ends) if len(ends) != 1 else f"from {ends[0]:g}"
+    return f"{whole} {told}".strip()
 
 
 def _value(kind: Kind, items: Kind, text: str, read_json: Callable[[str], Any]) -> Any:
     if kind == "json" or text.startswith(("{", "[")):
-        return read_json(text)
+        value = read_json(text)
+        return [value] if kind == "list" and isinstance(value, dict) else value
     if kind == "list":
         return [_scalar(items, part.strip()) for part in text.split(",") if part.strip()]
     return _scalar(kind, text)

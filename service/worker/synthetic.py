@@ -62,6 +62,7 @@ def payload_of(realization: Realization) -> dict[str, Any]:
         "versions": {"tasks": "1"},
         "noise_treatment": realization.analysis.noise_treatment,
         "regularisation": realization.analysis.regularisation,
+        "profile": realization.analysis.profile,
         "estimates": {name: estimate() for name in ESTIMATES},
         "aperture": {
             "radius": 1.0, "magnitude": quantity(host.magnitude + 0.1, 0.05), "coverage": 0.9, "draws": 30, "failed": 0,

@@ -214,6 +214,7 @@ def _error_code(error: BaseException) -> str:
     codes = {
         "InvalidResultError": "invalid_result",
         "SpecError": "invalid_spec",
+        "ObservationError": "invalid_observation",
         "EngineError": "engine_error",
         "MemoryError": "memory",
     }

@@ -8,12 +8,14 @@ from typing import Any
 from sqlalchemy import JSON, Boolean, Connection, DateTime, Float, Integer, MetaData, Table, func, select
 from sqlalchemy.sql.sqltypes import LargeBinary
 
+from service.domain.access import Scope
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.leases import Outcome
 from service.store.queue import Failure, RunQueue
 from service.store.tables import metadata
+from service.store.tokens import TokenStore
 from tests.service.conftest import Clock
 from tests.service.plans import body, planned, result_of, submit
 
@@ -33,7 +35,8 @@ def live(database: Database) -> None:
         clock.advance(60)
         return queue.claim(generation, 100)
 
-    grids.create(body(3, 1), lambda: planned(3, 1), "three of one kind", "key-1")
+    TokenStore(database, clock).create("somebody", Scope.SUBMIT)
+    grids.create(body(3, 1), lambda: planned(3, 1), "three of one kind", "key-1", owner="somebody")
     for lease in step():
         queue.store(lease, result_of(lease))
     queue.store(lease, result_of(lease))  # too late, and on record as such
@@ -91,7 +94,8 @@ def write(connection: Connection, rows: Rows) -> None:
                 column.name: row[column.name] if column.name in row else _made_up(connection, column)
                 for column in table.columns
                 if column.autoincrement is not True
-                and (column.name in row or not (column.nullable or column.server_default is not None))
+                # What is null is left out: a reflected JSON column would make a JSON null of it.
+                and (row.get(column.name) is not None or not (column.nullable or column.server_default is not None))
             }
             connection.execute(table.insert(), values)
 

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 import math
+import random
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from threading import BoundedSemaphore
+from typing import Any, BinaryIO
 
 import numpy as np
 import pandas
 import pytest
 from astropy.io import fits
 from astropy.io.votable import parse
-from astropy.table import Table
+from astropy.table import QTable, Table
 from fastapi.testclient import TestClient
 from pyarrow import parquet
 from sqlalchemy import update
 
 from service.api.app import create_app
 from service.exports.contents import Question, stamp
+from service.exports.spool import Spool, SpoolEndedError
 from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
@@ -134,6 +139,8 @@ def test_ecsv_is_read_by_astropy_with_units_descriptions_and_where_it_comes_from
         row[[column.name for column in columns].index("engine_digest")] for row in rows
     }
     datetime.fromisoformat(table.meta["picture_at"])
+    quantities = QTable.read(stored.file("ecsv", specs="true").decode().splitlines(), format="ascii.ecsv")
+    assert quantities["system", "magnitude", "magnitude_mean"]["magnitude_mean"].unit == "mag"
 
 
 def test_csv_is_read_by_pandas(stored: Stored) -> None:
@@ -277,3 +284,97 @@ def test_times_are_all_of_one_length() -> None:
     from datetime import UTC
 
     assert {len(stamp(datetime(2026, 1, 1, 0, 0, second, tzinfo=UTC))) for second in (0, 59)} == {32}
+
+
+def test_a_writer_ends_when_its_reader_has_gone() -> None:
+    async def go() -> BaseException | None:
+        spool, ended = Spool(60.0), []
+
+        def endless(sink: BinaryIO) -> None:
+            try:
+                while True:
+                    sink.write(b"x" * 2**16)
+            except OSError as error:
+                ended.append(error)
+                raise
+
+        with ThreadPoolExecutor(1) as threads:
+            writing = threads.submit(spool.fill, endless)
+            await spool.begun()
+            spool.abandon()
+            await asyncio.wrap_future(writing)
+        return ended[0] if ended else None
+
+    assert isinstance(asyncio.run(asyncio.wait_for(go(), 60)), SpoolEndedError)
+
+
+def test_what_goes_wrong_on_the_way_ends_the_file_and_says_so() -> None:
+    async def go(before: int) -> bytes:
+        spool = Spool(60.0)
+
+        def broken(sink: BinaryIO) -> None:
+            sink.write(b"x" * before)
+            raise LookupError("on purpose")
+
+        with ThreadPoolExecutor(1) as threads:
+            threads.submit(spool.fill, broken)
+            await spool.begun()
+            return b"".join([data async for data in spool.read_all()])
+
+    for before in (0, 2**20):
+        with pytest.raises(LookupError, match="on purpose"):
+            asyncio.run(go(before))
+
+
+def test_a_picture_is_not_held_for_longer_than_allowed() -> None:
+    async def go() -> None:
+        spool = Spool(0.0)
+        with ThreadPoolExecutor(1) as threads:
+            threads.submit(spool.fill, lambda sink: sink.write(b"x"))
+            await spool.begun()
+
+    with pytest.raises(SpoolEndedError, match="longer than is allowed"):
+        asyncio.run(go())
+
+
+def test_a_reader_gets_every_byte_whether_it_is_faster_or_slower() -> None:
+    wanted = random.Random(1).randbytes(3 * 2**20 + 17)
+
+    async def go(pause_s: float) -> bytes:
+        spool = Spool(60.0)
+        with ThreadPoolExecutor(1) as threads:
+            threads.submit(
+                spool.fill, lambda sink: [sink.write(wanted[at : at + 1000]) for at in range(0, len(wanted), 1000)]
+            )
+            await spool.begun()
+            found = []
+            async for data in spool.read_all():
+                found.append(data)
+                await asyncio.sleep(pause_s)
+            return b"".join(found)
+
+    for pause_s in (0.0, 0.01):
+        assert asyncio.run(go(pause_s)) == wanted
+
+
+def test_more_exports_at_a_time_than_there_are_places_are_told_to_come_again(
+    stored: Stored, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = BoundedSemaphore(1)
+    monkeypatch.setattr("service.api.exports._places", places)
+    assert places.acquire(blocking=False)
+    full = stored.client.get("/v1/results.csv")
+    assert (full.status_code, full.headers["retry-after"]) == (503, "5")
+    places.release()
+    for _ in range(3):
+        assert stored.client.get("/v1/results.csv").status_code == 200
+        assert places.acquire(timeout=60), "a place was not given back"
+        places.release()
+
+
+def test_a_database_that_is_away_is_a_problem_before_the_first_byte(tmp_path: Path) -> None:
+    with TestClient(
+        create_app(Settings(database_url=f"sqlite:///{tmp_path / 'none.sqlite'}", data_dir=tmp_path))
+    ) as client:
+        answer = client.get("/v1/results.parquet")
+    assert (answer.status_code, answer.headers["content-type"]) == (503, "application/problem+json")

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from engine import read_observation, realization_from_dict, system_from_mapping
 from service.api.app import create_app
 from service.cli.app import app
-from service.cli.pictures import named_or_read
+from service.cli.request_file import named_or_read
 from service.runtime.settings import Settings
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
@@ -210,5 +210,5 @@ def test_help_does_not_load_the_engine() -> None:
 
 
 def test_a_request_names_systems_and_carries_the_tables_of_those_in_files() -> None:
-    assert named_or_read("HE0435") == "HE0435"
-    assert named_or_read(str(EXAMPLES / "my_system.toml")) == OWN
+    assert named_or_read("HE0435", "--system") == "HE0435"
+    assert named_or_read(str(EXAMPLES / "my_system.toml"), "--system") == OWN

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
@@ -12,6 +13,7 @@ from playwright.sync_api import Browser, expect
 from tests.service.browser import DESKTOP, PHONE, Watched, chromium, tab
 from tests.service.service_process import eventually, serving
 
+OWN = Path(__file__).resolve().parents[2] / "docs" / "examples" / "my_double.json"
 PATIENCE_MS = 120_000
 POINT = {"preset": "h0licow-vi/HE0435", "n": "2", "magnitude": "20.5", "l_eta": "1.0", "r_eff": "0.39"}
 
@@ -86,6 +88,23 @@ def test_errors_of_a_form_stand_at_their_fields_with_what_was_typed(browser: Bro
         # The status of such an answer is an error to the browser, too.
         assert all("422" in said for said in opened.wrong)
         opened.wrong.clear()
+
+
+def test_a_lens_of_ones_own_is_submitted_by_page_to_the_figure_of_its_biases(browser: Browser, address: str) -> None:
+    with tab(browser, address) as opened:
+        page = opened.open("/submit")
+        for name, value in {"n": "2, 4", "magnitude": "21", "l_eta": "1", "r_eff": "0.35", "name": "my own"}.items():
+            page.locator(f"[name={name}]").fill(value)
+        page.locator("[name=systems]").fill(OWN.read_text())
+        page.get_by_role("button", name="Check, start nothing").click()
+        expect(page.locator("#dry-run")).to_contain_text("This would be 2 runs")
+        page.get_by_role("button", name="Submit").click()
+        page.wait_for_url("**/grids/g_*")
+        expect(page.locator("#live .badge")).to_have_text("done", timeout=PATIENCE_MS)
+        image = page.locator("#figures img")
+        expect(image).to_be_visible(timeout=PATIENCE_MS)
+        image.scroll_into_view_if_needed()
+        eventually(lambda: image.evaluate("image => image.complete && image.naturalWidth") > 400, what="the figure")
 
 
 def test_a_grid_is_paused_resumed_and_cancelled_by_page(browser: Browser, address: str) -> None:

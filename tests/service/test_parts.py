@@ -184,9 +184,6 @@ def test_a_process_is_known_to_be_dead_only_on_its_own_machine() -> None:
 
 
 def test_settings_are_checked_at_the_door(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValidationError, match="ALLOW_REMOTE"):
-        Settings(host="0.0.0.0")  # noqa: S104 - that it is refused is the point
-    assert Settings(host="0.0.0.0", allow_remote=True).host  # noqa: S104
     with pytest.raises(ValidationError, match="LEADER_TTL"):
         Settings(leader_ttl_s=5, heartbeat_s=5)
     monkeypatch.setenv("HOSTLENS_PORT", "99999")

@@ -60,7 +60,7 @@ REFUSED = [
     ("HOSTLENS_SLURM_PROLOGUE", "[1, 2]", "HOSTLENS_SLURM_PROLOGUE"),
     ("HOSTLENS_SLURM_PROLOGUE", "[" * 100_000, "HOSTLENS_SLURM_PROLOGUE"),
     ("HOSTLENS_SLURM_WALLTIME", "a day", "allowed is a time as Slurm"),
-    ("HOSTLENS_ALLOW_REMOTE", "perhaps", "HOSTLENS_ALLOW_REMOTE"),
+    ("HOSTLENS_AUTH", "perhaps", "HOSTLENS_AUTH"),
     ("HOSTLENS_HOST", "http://127.0.0.1", "allowed is the name or the address"),
     ("HOSTLENS_HOST", "::zz", "allowed is the name or the address"),
     ("HOSTLENS_CLUSTER", "cloud", "HOSTLENS_CLUSTER"),
@@ -147,7 +147,7 @@ def test_a_tilde_is_the_home_wherever_a_path_may_stand(monkeypatch: pytest.Monke
     ],
 )
 def test_the_service_is_reached_where_it_listens_in_either_family(host: str, url: str) -> None:
-    assert Settings(host=host, allow_remote=True).url == url
+    assert Settings(host=host).url == url
 
 
 @contextlib.contextmanager
@@ -177,7 +177,7 @@ def test_what_the_settings_name_is_looked_at_before_a_start(tmp_path: Path, monk
         assert f"HOSTLENS_METRICS_PORT: cannot listen on 127.0.0.1:{other}" in found
     assert "both" in refusal(Settings(data_dir=data, port=port, metrics_port=port))
     # Kept for documentation: no machine has it.
-    assert "HOSTLENS_HOST" in refusal(Settings(data_dir=data, port=port, host="192.0.2.1", allow_remote=True))
+    assert "HOSTLENS_HOST" in refusal(Settings(data_dir=data, port=port, host="192.0.2.1"))
     assert "HOSTLENS_ARTEFACT_URL" in refusal(Settings(data_dir=data, port=port, artefact_url="nothing://x"))
     assert "HOSTLENS_ARTEFACT_URL" in refusal(Settings(data_dir=data, port=port, artefact_url=str(file / "x")))
     assert "is not a file" in refusal(Settings(data_dir=data, port=port, database_url=f"sqlite:///{tmp_path}"))

@@ -779,8 +779,8 @@ def test_a_run_whose_specification_nobody_can_read_fails_with_its_reason_and_kee
     with database.read() as connection:
         row = connection.execute(select(run.c.state, run.c.error_code, run.c.error_detail).where(run.c.id == broken))
         assert tuple(row.one()) == ("failed", "invalid_spec", "the stored specification is not a JSON object")
-        kinds = connection.scalars(select(event.c.kind).where(event.c.run_id == broken)).all()
-        assert kinds == ["run_failed"]
+        kinds = connection.scalars(select(event.c.kind).where(event.c.run_id == broken).order_by(event.c.id)).all()
+        assert kinds == ["run_started", "run_failed"]
     for lease in leases:
         queue.store(lease, result_of(lease))
     assert grids.grid(grid_id).state is GridState.FAILED

@@ -29,7 +29,7 @@ from service.store.orphans import DAMAGED, FOREIGN, REFERRED, YOUNG, Orphans, ol
 from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
 from service.store.retention import NEWEST, OPEN, YOUNGER, Retention, Share
-from service.store.tables import attempt, event, idempotency, result
+from service.store.tables import attempt, event, idempotency, measurement, result
 from tests.service.conftest import Clock
 from tests.service.plans import body, planned, result_of
 
@@ -72,10 +72,10 @@ def service(database: Database, clock: Clock) -> Service:
     return Service(database, clock)
 
 
-def rows(database: Database) -> tuple[int, int, int]:
+def rows(database: Database) -> tuple[int, ...]:
     with database.read() as connection:
-        counts = [connection.scalar(select(func.count()).select_from(t)) for t in (event, attempt, idempotency)]
-    return counts[0] or 0, counts[1] or 0, counts[2] or 0
+        tables = (event, attempt, idempotency, measurement)
+        return tuple(connection.scalar(select(func.count()).select_from(table)) or 0 for table in tables)
 
 
 def prune(found: Retention) -> dict[str, int]:
@@ -89,11 +89,12 @@ def test_what_has_ended_long_ago_goes_and_what_stays_is_told_with_its_reason(ser
     opened = service.grid(4)
     found = Retention(service.database, service.clock() - 90 * DAYS)
     shares = list(found.shares())
-    # A grid has events of its submission, of each run and of its end, an attempt a run, and a key.
+    # A grid has events of its submission, of each run's start and end and of its own end, an attempt a run, and a key.
     assert shares == [
-        Share("events", 6, {NEWEST: 2, YOUNGER: 4, OPEN: 1}),
+        Share("events", 10, {NEWEST: 2, YOUNGER: 6, OPEN: 1}),
         Share("attempts", 4, {YOUNGER: 2}),
         Share("idempotency keys", 2, {YOUNGER: 1, OPEN: 1}),
+        Share("measurements", 0, {}),
     ]
     before = rows(service.database)
     shown = {grid_id: service.grids.grid(grid_id) for grid_id in (*old, young, opened)}
@@ -111,7 +112,7 @@ def test_it_goes_in_pieces(service: Service, monkeypatch: pytest.MonkeyPatch) ->
     for number in range(1, 4):
         service.done(number)
     found = Retention(service.database, service.clock() + DAYS)
-    assert list(found.prune("events")) == [2, 2, 2, 2, 1]
+    assert list(found.prune("events")) == [2, 2, 2, 2, 2, 2, 2, 1]
     assert list(found.prune("attempts")) == [2, 2, 2]
 
 
@@ -167,7 +168,7 @@ def test_a_stream_that_was_left_before_what_is_kept_begins_anew_with_the_whole_s
         lines = answer.text.splitlines()
         return [line.removeprefix("event: ") for line in lines if line.startswith("event: ")]
 
-    assert kinds(first) == ["run_done", "run_done", "grid_finished"]
+    assert kinds(first) == ["run_started", "run_started", "run_done", "run_done", "grid_finished"]
     prune(Retention(service.database, service.clock() + DAYS))
     assert kinds(first) == ["grid"]
     assert kinds(last) == []
@@ -287,7 +288,7 @@ def test_nothing_is_deleted_without_a_yes(aged: str, service: Service, tmp_path:
 def test_with_yes_it_does_not_ask_and_a_repetition_finds_nothing(aged: str, service: Service) -> None:
     first = run_command("--older-than", "90d", "--yes")
     assert first.exit_code == 0, first.output
-    assert "deleted 6 rows and 1 files" in first.output
+    assert "deleted 8 rows and 1 files" in first.output
     again = run_command("--older-than", "90d")
     assert (again.exit_code, "nothing to delete" in again.output) == (0, True)
 

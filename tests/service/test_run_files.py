@@ -20,7 +20,8 @@ from typer.testing import CliRunner
 
 from service.api.app import create_app
 from service.cli.app import app
-from service.domain.payload import ResultPayload, read_payload
+from service.cli.replay import differences, read_record
+from service.domain.payload import ESTIMATES, ResultPayload, read_payload
 from service.domain.requests import GridRequest, plan
 from service.domain.views import RunRecord
 from service.exports.record import found_by
@@ -154,11 +155,26 @@ def files(ran: Ran, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]
     return {file.name: file for file in folder.iterdir()}
 
 
-@pytest.mark.parametrize("name", ["run.json", "run.ecsv", "run.parquet"])
-def test_a_replay_finds_the_same_to_the_last_bit(ran: Ran, files: dict[str, Path], name: str) -> None:
-    told = CliRunner().invoke(app, ["replay", str(files[name]), ran.run_id])
+def test_a_replay_finds_the_same_to_the_last_bit(ran: Ran, files: dict[str, Path]) -> None:
+    told = CliRunner().invoke(app, ["replay", str(files["run.json"]), ran.run_id])
     assert told.exit_code == 0, told.output
     assert "the same to the last bit" in told.output
+
+
+@pytest.mark.parametrize("name", ["run.ecsv", "run.parquet"])
+@pytest.mark.parametrize("chosen", [True, False])
+def test_an_export_with_specs_holds_what_a_record_holds(
+    ran: Ran, files: dict[str, Path], name: str, chosen: bool
+) -> None:
+    record, found = read_record(files["run.json"], None), read_record(files[name], ran.run_id if chosen else None)
+    for part in ("run_id", "spec", "engine_digest", "payload_digest", "versions"):
+        assert getattr(found, part) == getattr(record, part)
+    # Of the other estimators there is nothing in it.
+    told = {key: value for key, value in record.found.items() if not key.startswith(ESTIMATES) or "image_wide" in key}
+    assert {key: found.found[key] for key in told} == told
+    assert list(differences(found, ran.payload, found.versions)) == [
+        "no number of the export: what differs is a warning or a name"
+    ]
 
 
 def test_a_replay_says_what_differs_the_largest_first(ran: Ran, files: dict[str, Path], tmp_path: Path) -> None:
@@ -196,7 +212,12 @@ def test_a_replay_says_what_differs_the_largest_first(ran: Ran, files: dict[str,
     ],
 )
 def test_a_file_that_cannot_be_replayed_is_refused(
-    files: dict[str, Path], name: str, run: str | None, told: str, tmp_path: Path
+    files: dict[str, Path],
+    name: str,
+    run: str | None,
+    told: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     file = files.get(name, tmp_path / name)
     if name.startswith("garbage"):
@@ -206,6 +227,7 @@ def test_a_file_that_cannot_be_replayed_is_refused(
     with pytest.raises(SystemExit) as end:
         app(["replay", str(file), *([run] if run else [])])
     assert end.value.code == 2
+    assert told in capsys.readouterr().err
 
 
 def test_without_a_result_there_is_no_file(ran: Ran) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 from urllib.parse import urlencode
 
@@ -11,7 +12,7 @@ from fastapi.responses import RedirectResponse
 
 from engine import GROUPINGS
 from service.api.context import Context, GridId, Service
-from service.api.site.origin import OwnPage
+from service.api.gate import Asking, require_owner
 from service.api.site.questions import (
     DEFAULT_ESTIMATE,
     SHOWN_AXES,
@@ -43,6 +44,8 @@ _KINDS = (
     "grid", "grid_cancelled", "grid_paused", "grid_resumed", "grid_revived", "run_started", "run_done", "run_failed",
     "run_quarantined", "run_cancelled", "run_requeued",
 )  # fmt: skip
+_FORMAT_NAMES = {"csv": "CSV", "ecsv": "ECSV", "parquet": "Parquet", "vot": "VOTable", "fits": "FITS"}
+"""Files of results, by what the address ends with."""
 _FIGURES: tuple[tuple[FigureKind, str, str], ...] = (
     ("bias", "Biases", "Biases of magnitude, radius and index by serial number, and their means"),
     ("sample", "Sample", "Bias of the magnitude against arc, contrast and surface brightness"),
@@ -127,10 +130,14 @@ def progress(grid_id: GridId, service: Service) -> Response:
 
 @router.post("/grids/{grid_id}/{action}")
 def act(
-    grid_id: GridId, action: Literal["cancel", "pause", "resume", "retry"], service: Service, _own: OwnPage
+    grid_id: GridId,
+    action: Literal["cancel", "pause", "resume", "retry"],
+    service: Service,
+    caller: Asking,
 ) -> Response:
     """Do something to a grid and show it again."""
-    actions = {
+    require_owner(caller, service.grids, grid_id)
+    actions: dict[str, Callable[[str], object]] = {
         "cancel": service.grids.cancel,
         "pause": service.grids.pause,
         "resume": service.grids.resume,
@@ -183,9 +190,10 @@ def _figure(grid: GridView, shown: dict[str, str]) -> dict[str, Any]:
 
 
 def _downloads(grid_id: str) -> list[tuple[str, str]]:
+    files = [(_FORMAT_NAMES[kind], f"/v1/results.{kind}?grid={grid_id}") for kind in _FORMAT_NAMES]
     return [
-        ("Results as JSON", f"/v1/results?grid={grid_id}"),
-        ("Biases as JSON", f"/v1/summary?grid={grid_id}"),
-        ("Runs", f"/v1/grids/{grid_id}/runs"),
-        ("Events", f"/v1/grids/{grid_id}/events"),
+        *files,
+        ("Results (JSON)", f"/v1/results?grid={grid_id}"),
+        ("Biases (JSON)", f"/v1/summary?grid={grid_id}"),
+        ("Runs (JSON)", f"/v1/grids/{grid_id}/runs"),
     ]

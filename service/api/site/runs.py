@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
@@ -22,7 +23,9 @@ def one_run(request: Request, run_id: RunId, service: Service) -> Response:
     result = run["result"]
     names = sorted(ESTIMATES, key=lambda name: name != RECOMMENDED)
     found = {} if result is None else result["estimates"]
-    provenance = [("Realization", run["digest"]), ("Seed", str(run["inputs"]["seed"]))]
+    # An image that somebody has measured has no inputs.
+    seed = run["inputs"].get("seed")
+    provenance = [("Realization", run["digest"]), *([] if seed is None else [("Seed", str(seed))])]
     if run["paper_run"] is not None:
         provenance.insert(0, ("Serial number in Table 3", str(run["paper_run"])))
     if result is not None:
@@ -31,7 +34,7 @@ def one_run(request: Request, run_id: RunId, service: Service) -> Response:
             ("Engine", result["engine_digest"]),
             ("Profile", result["profile"] or "made by hand"),
         ]
-    record = f"{request.url.scheme}://{request.url.netloc}/v1/runs/{run_id}"
+    record = f"{request.url.scheme}://{request.url.netloc}/v1/runs/{run_id}/record"
     return page(
         "run.html",
         here="",
@@ -42,6 +45,16 @@ def one_run(request: Request, run_id: RunId, service: Service) -> Response:
         estimates=[(name, found[name]) for name in names if found.get(name)],
         recommended=RECOMMENDED,
         provenance=provenance,
+        downloads=_downloads(run_id, result),
         spec_text=json.dumps(run["spec"], indent=1, ensure_ascii=False),
         replay=result and f"curl -s {record} > run.json\nhostlens replay run.json",
     )
+
+
+def _downloads(run_id: str, result: dict[str, Any] | None) -> list[tuple[str, str]]:
+    if result is None:
+        return []
+    own = f"/v1/runs/{run_id}"
+    arrays = [] if result["products"] is None else [("Arrays (npz)", f"{own}/products"), ("FITS", f"{own}/fits")]
+    chain = [("Chain (NetCDF)", f"{own}/chain.nc")] if arrays and result["chain"] is not None else []
+    return [("Record (JSON)", f"{own}/record"), *arrays, *chain]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 from typing import Any
 from urllib.parse import parse_qs
@@ -26,8 +27,8 @@ from engine import (
     system_names,
 )
 from service.api.context import Context, Service
+from service.api.gate import Asking
 from service.api.problems import UnsupportedBodyError
-from service.api.site.origin import OwnPage
 from service.api.threads import PATIENT, Route, run_in
 from service.domain.requests import GridRequest, Plan, TooManyRunsError, plan
 from service.web.form import Field, document_of, field_of, form_fields
@@ -46,8 +47,8 @@ _LABELS = {
 _HINTS = {
     "name": "what it is called in lists and figures",
     "preset": "a part of the grid of the paper",
-    "systems": f"of {', '.join(system_names())}; or a list of objects as JSON",
-    "camera": f"instead of the systems' own: {', '.join(camera_names())}; or an object as JSON",
+    "systems": f"of {', '.join(system_names())}; or a system of your own as JSON",
+    "camera": f"instead of the systems' own: {', '.join(camera_names())}; or a camera of your own as JSON",
     "mass_model": "of the systems",
     "n": "as 1, 2, 4",
     "r_eff": "half-light radius [arcsec]",
@@ -65,16 +66,16 @@ def empty_form() -> Response:
 
 
 @router.post("/submit")
-async def submitted(request: Request, service: Service, _own: OwnPage) -> Response:
+async def submitted(request: Request, service: Service, caller: Asking) -> Response:
     """Check what was filled in, or start it and go to its page; the form again where something is wrong."""
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != _FORM:
         raise UnsupportedBodyError("content-type", kind, _FORM, {"Accept-Post": _FORM})
     typed = parse_qs((await request.body()).decode("utf-8", "replace"), max_num_fields=_MOST_FIELDS)
-    return await run_in(PATIENT, _take, service, {name: values[-1] for name, values in typed.items()})
+    return await run_in(PATIENT, _take, service, caller.name, {name: values[-1] for name, values in typed.items()})
 
 
-def _take(service: Context, typed: Mapping[str, str]) -> Response:
+def _take(service: Context, owner: str | None, typed: Mapping[str, str]) -> Response:
     fields = [replace(field, value=typed.get(field.name, "")) for field in _fields()]
     document, wrong = document_of(fields, typed, _json)
     body, runs = None, None
@@ -87,7 +88,13 @@ def _take(service: Context, typed: Mapping[str, str]) -> Response:
         dry = {"n_runs": len(runs), "labels": [run.label for run in islice(runs, _SHOWN_LABELS)]}
         return _page(fields, dry=dry)
     made = service.grids.create(
-        body.canonical(), lambda: runs, body.name, f"page:{key}" if key else None, engine_digest()
+        body.canonical(),
+        lambda: runs,
+        body.name,
+        f"page:{key}" if key else None,
+        engine_digest(),
+        owner,
+        lambda: service.costs.expected_wall_s(runs.kinds()),
     )
     return RedirectResponse(f"/grids/{made.grid.id}", 303, {"Cache-Control": "no-store"})
 
@@ -121,7 +128,8 @@ def _planned(
         return None, None, {"systems": str(error)}
 
 
-def _fields() -> list[Field]:
+@cache
+def _fields() -> tuple[Field, ...]:
     found = []
     for field in form_fields(GridRequest.model_json_schema()):
         said = "; ".join(filter(None, (_HINTS.get(field.name, ""), field.hint)))
@@ -130,11 +138,11 @@ def _fields() -> list[Field]:
         label = _LABELS.get(field.name, field.label)
         found.append(replace(field, label=label, hint=said, options=options, blank=blank))
     order = {name: place for place, name in enumerate(_MAIN)}
-    return sorted(found, key=lambda field: order.get(field.name, len(order)))
+    return tuple(sorted(found, key=lambda field: order.get(field.name, len(order))))
 
 
 def _page(
-    fields: list[Field],
+    fields: Sequence[Field],
     wrong: Mapping[str, str] | None = None,
     dry: dict[str, Any] | None = None,
     key: str = "",
