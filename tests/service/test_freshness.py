@@ -226,4 +226,8 @@ def test_lists_have_a_short_form_with_the_same_pages(api: TestClient, settings: 
     assert [run["ordinal"] for run in runs["items"]] == [0, 1, 2]
     assert all(api.get(run["links"]["figure"]).content == PNG for run in runs["items"])
     waiting = api.get(second["links"]["runs"] + "?compact=true").json()["items"]
-    assert [(run["state"], run["links"].keys()) for run in waiting] == [("queued", {"self"})] * 2
+    assert [(run["state"], run["links"].keys()) for run in waiting] == [("queued", {"self", "page"})] * 2
+    # Each has a page for people, too.
+    for item in (second, *page["items"], *runs["items"], api.get(runs["items"][0]["links"]["self"]).json()):
+        assert api.get(item["links"]["page"]).headers["content-type"].startswith("text/html"), item
+        assert item["id"] in item["links"]["page"]
