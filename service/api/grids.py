@@ -30,6 +30,7 @@ from service.domain.views import (
     CompactGridPage,
     CompactRunPage,
     DryRun,
+    GridKind,
     GridPage,
     GridView,
     RetriedGrid,
@@ -94,9 +95,10 @@ def list_grids(
     limit: Limit = 100,
     cursor: Annotated[str | None, Query(pattern=GRID_PATTERN, description="From Link or next")] = None,
     compact: Compact = False,
+    kind: Annotated[GridKind, Query(description="measurement: of uploaded images, one run each")] = "simulation",
 ) -> GridPage | CompactGridPage:
-    """Grids, newest first."""
-    page = service.grids.grids(limit, cursor, with_requests=not compact)
+    """Grids, newest first; those that measure uploaded images where they are asked for."""
+    page = service.grids.grids(limit, cursor, with_requests=not compact, kind=kind)
     if compact:
         return CompactGridPage(items=compact_grids(page.items), next=next_link(request, response, page.next))
     return GridPage(items=link_grids(page.items), next=next_link(request, response, page.next))

@@ -17,7 +17,7 @@ def link_grid(grid: GridView) -> GridView:
     """A grid with the addresses of its parts and of what may be done to it."""
     own = f"/v1/grids/{grid.id}"
     parts = {name: f"{own}/{name}" for name in ("runs", "summary", "events", *_ACTIONS)}
-    return grid.model_copy(update={"links": {"self": own, **parts}})
+    return grid.model_copy(update={"links": {"self": own, "page": f"/grids/{grid.id}", **parts}})
 
 
 def link_grids(grids: Sequence[GridView]) -> list[GridView]:
@@ -41,7 +41,7 @@ def link_run_items(runs: Sequence[RunItem]) -> list[RunItem]:
     return [
         run.model_copy(
             update={
-                "links": {"self": f"/v1/runs/{run.id}"}
+                "links": {"self": f"/v1/runs/{run.id}", "page": f"/runs/{run.id}"}
                 | {part: f"/v1/runs/{run.id}/{part}" for part in _PARTS if part in run.links}
             }
         )
@@ -62,7 +62,7 @@ def link_document(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _run_links(run_id: str, grid_id: str) -> Links:
-    return {"self": f"/v1/runs/{run_id}", "grid": f"/v1/grids/{grid_id}"}
+    return {"self": f"/v1/runs/{run_id}", "page": f"/runs/{run_id}", "grid": f"/v1/grids/{grid_id}"}
 
 
 def link_measurement(found: MeasurementView) -> MeasurementView:

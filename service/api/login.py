@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import html
 from typing import Annotated
 from urllib.parse import parse_qs, urlsplit
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi.responses import RedirectResponse
 
 from service.api.context import Service
 from service.api.gate import COOKIE, LOGIN, LOGOUT
 from service.api.problems import InvalidRequestError, UnsupportedBodyError, problem
 from service.api.threads import QUICK, run_in
+from service.web.rendering import page
 
 router = APIRouter(include_in_schema=False)
 _FORM = "application/x-www-form-urlencoded"
-_PRIVATE = {"Cache-Control": "no-store", "Content-Security-Policy": "default-src 'self'; form-action 'self'"}
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>hostlens: log in</title><link rel="stylesheet" href="/static/style.css"></head>
-<body><main><h1>hostlens</h1>{said}
-<form method="post" action="/login"><input type="hidden" name="next" value="{next}">
-<p><label>Token <input name="token" type="password" required autocomplete="current-password"></label>
-<button>Log in</button></p></form>
-<p>Whoever runs this service makes tokens: <code>hostlens token create</code>.</p></main></body></html>
-"""
+_PRIVATE = {"Cache-Control": "no-store"}
 Next = Annotated[str, Query(max_length=2000, description="Where to go on")]
 
 
@@ -49,7 +40,7 @@ async def log_in(request: Request, service: Service) -> Response:
     wanted = fields.get("next", ["/"])[-1]
     if await run_in(QUICK, service.tokens.caller, given) is None:
         if "text/html" in request.headers.get("accept", ""):
-            return _page(wanted, "<p role='alert'>This token is not valid.</p>", 401)
+            return _page(wanted, 401)
         return problem(request, 401, "the token is not valid", headers={"WWW-Authenticate": 'Bearer realm="hostlens"'})
     answer = RedirectResponse(_own(wanted), 303, {"Cache-Control": "no-store"})
     answer.set_cookie(COOKIE, given, httponly=True, samesite="strict", secure=request.url.scheme == "https", path="/")
@@ -72,8 +63,7 @@ def _own(address: str) -> str:
     return address if is_path and address.isprintable() and "\\" not in address else "/"
 
 
-def _page(wanted: str, said: str = "", status: int = 200) -> Response:
-    text = _PAGE.format(next=html.escape(_own(wanted)), said=said)
-    return HTMLResponse(
-        text, status, _PRIVATE | ({"WWW-Authenticate": 'Bearer realm="hostlens"'} if status == 401 else {})
-    )
+def _page(wanted: str, status: int = 200) -> Response:
+    is_wrong = status == 401
+    headers = _PRIVATE | ({"WWW-Authenticate": 'Bearer realm="hostlens"'} if is_wrong else {})
+    return page("login.html", status, headers, here="", next=_own(wanted), is_wrong=is_wrong)

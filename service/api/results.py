@@ -11,6 +11,7 @@ from pydantic_core import to_json
 
 from service.api.answer_views import bias_view, difference_view, six
 from service.api.context import Service
+from service.api.freshness import NOT_MODIFIED, REVALIDATED, IfNoneMatch, is_known, not_modified, weak_tag
 from service.api.pages import next_link
 from service.api.problems import InvalidRequestError
 from service.api.threads import Route, patient
@@ -24,10 +25,12 @@ from service.store.answers import (
     biases_by_group,
     compare,
     failures_by_group,
+    failures_digest,
     first_runs,
     grouped,
     trend,
 )
+from service.store.bias_rows import content
 from service.store.result_filter import AXES, NONE, FilterError, ResultFilter
 from service.store.result_rows import QUANTITY_UNITS, result_columns, result_rows
 
@@ -97,14 +100,22 @@ class ResultQuery(RowsQuery):
     cursor: str | None = Field(default=None, pattern=RUN_PATTERN, description="From Link or next")
 
 
-@router.get("/summary", response_model=SummaryAnswer)
+@router.get("/summary", response_model=SummaryAnswer, responses=NOT_MODIFIED)
 @patient
 def summary(
-    request: Request, response: Response, service: Service, query: Annotated[SummaryQuery, Query()]
+    request: Request,
+    response: Response,
+    service: Service,
+    query: Annotated[SummaryQuery, Query()],
+    if_none_match: IfNoneMatch = None,
 ) -> Response:
     """Biases by group over one, several or all grids: how large, how sure, how far the stated errors hold."""
     question, axes = _question(query), _axes(query.group_by)
     with service.database.read() as connection:
+        # Failed runs are counted beside the results.
+        tag = weak_tag(request, content(connection, question.where), failures_digest(connection))
+        if is_known(tag, if_none_match):
+            return not_modified(tag)
         groups = grouped(connection, question.where, axes)
         biases, answered = biases_by_group(connection, question, groups)
         failed, elsewhere = failures_by_group(connection, question.where, groups)
@@ -130,15 +141,23 @@ def summary(
         "failed_elsewhere": elsewhere,
         "next": next_link(request, response, following),
     }
-    return _written(answer, response)
+    return _written(answer, tag, response)
 
 
-@router.get("/trends", response_model=TrendAnswer)
+@router.get("/trends", response_model=TrendAnswer, responses=NOT_MODIFIED)
 @patient
-def trends(response: Response, service: Service, query: Annotated[TrendQuery, Query()]) -> Response:
+def trends(
+    request: Request,
+    service: Service,
+    query: Annotated[TrendQuery, Query()],
+    if_none_match: IfNoneMatch = None,
+) -> Response:
     """Biases against a property of the observation, as binned series: one for each group."""
     question, axes = _question(query), _axes(query.group_by)
     with service.database.read() as connection:
+        tag = weak_tag(request, content(connection, question.where))
+        if is_known(tag, if_none_match):
+            return not_modified(tag)
         groups = grouped(connection, question.where, axes)
         found = trend(connection, question, groups, query.against, query.bins)
     series = []
@@ -162,16 +181,24 @@ def trends(response: Response, service: Service, query: Annotated[TrendQuery, Qu
         "against_unit": TRENDS[query.against][1],
         "series": series,
     }
-    return _written(answer, response)
+    return _written(answer, tag)
 
 
-@router.get("/comparison", response_model=ComparisonAnswer)
+@router.get("/comparison", response_model=ComparisonAnswer, responses=NOT_MODIFIED)
 @patient
-def comparison(response: Response, service: Service, query: Annotated[ComparisonQuery, Query()]) -> Response:
+def comparison(
+    request: Request,
+    service: Service,
+    query: Annotated[ComparisonQuery, Query()],
+    if_none_match: IfNoneMatch = None,
+) -> Response:
     """Two analyses of the same observations: the mean difference with its own error, which their scatter is not in."""
     question, axes = _question(query), _axes(query.group_by)
     left, right = (_side(query, name) for name in ("left", "right"))
     with service.database.read() as connection:
+        tag = weak_tag(request, content(connection, question.where))
+        if is_known(tag, if_none_match):
+            return not_modified(tag)
         groups, found = compare(connection, question, query.compare, left, right, axes)
     rows = [
         {
@@ -183,18 +210,28 @@ def comparison(response: Response, service: Service, query: Annotated[Comparison
         if found.difference.number[place]
     ]
     asked = {"compare": query.compare, "left": query.left, "right": query.right}
-    return _written({"question": _asked(query, axes), **asked, "rows": rows}, response)
+    return _written({"question": _asked(query, axes), **asked, "rows": rows}, tag)
 
 
-@router.get("/results", response_model=ResultPage)
+@router.get("/results", response_model=ResultPage, responses=NOT_MODIFIED)
 @patient
-def results(request: Request, response: Response, service: Service, query: Annotated[ResultQuery, Query()]) -> Response:
+def results(
+    request: Request,
+    response: Response,
+    service: Service,
+    query: Annotated[ResultQuery, Query()],
+    if_none_match: IfNoneMatch = None,
+) -> Response:
     """Results as flat rows: what was put in, what one estimator (or each) recovered, and how the run went."""
     names = wanted_estimates(query)
     columns = result_columns(names)
     keys = [column.name for column in columns]
+    where = read_filter(query)
     with service.database.read() as connection:
-        found = result_rows(connection, read_filter(query), names, columns, after=query.cursor, limit=query.limit + 1)
+        tag = weak_tag(request, content(connection, where))
+        if is_known(tag, if_none_match):
+            return not_modified(tag)
+        found = result_rows(connection, where, names, columns, after=query.cursor, limit=query.limit + 1)
         rows = [dict(zip(keys, row, strict=True)) for row in found]
     following = rows[query.limit - 1]["run_id"] if len(rows) > query.limit else None
     answer = {
@@ -202,11 +239,12 @@ def results(request: Request, response: Response, service: Service, query: Annot
         "items": rows[: query.limit],
         "next": next_link(request, response, following),
     }
-    return _written(answer, response)
+    return _written(answer, tag, response)
 
 
-def _written(answer: dict[str, Any], response: Response) -> Response:
-    return Response(to_json(answer), media_type="application/json", headers=dict(response.headers))
+def _written(answer: dict[str, Any], tag: str, response: Response | None = None) -> Response:
+    headers = {} if response is None else dict(response.headers)
+    return Response(to_json(answer), media_type="application/json", headers={**headers, "ETag": tag, **REVALIDATED})
 
 
 def given_filter(query: BaseModel) -> dict[str, list[str]]:

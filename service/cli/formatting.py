@@ -7,7 +7,16 @@ from collections.abc import Iterable
 from rich.table import Table
 
 from service.domain.payload import EstimateName
-from service.domain.views import DryRun, GridView, RunView, Summary, SummaryEstimate, SummaryValue
+from service.domain.views import (
+    Cost,
+    DryRun,
+    GridView,
+    Interval,
+    RunView,
+    Summary,
+    SummaryEstimate,
+    SummaryValue,
+)
 
 _INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
 ROWS: tuple[tuple[EstimateName, str, str], ...] = (
@@ -25,6 +34,7 @@ ROWS: tuple[tuple[EstimateName, str, str], ...] = (
 
 
 _SHOWN_LABELS = 10
+_SHOWN_KINDS = 3
 
 
 def value_of(estimate: SummaryEstimate, quantity: str) -> SummaryValue:
@@ -96,7 +106,24 @@ def dry_run_lines(found: DryRun) -> list[str]:
         f"{found.n_runs} run{'' if found.n_runs == 1 else 's'}",
         *shown,
         *([f"... and {more} more"] if more else []),
+        *_cost_lines(found.cost),
     ]
+
+
+def _cost_lines(cost: Cost) -> list[str]:
+    """What they should take, or of which kind too few runs are stored to say so."""
+    if cost.cpu_s is None:
+        kinds = [f"{kind.camera}, {kind.configuration}, {kind.profile}" for kind in cost.unknown]
+        more = [f"and {len(kinds) - _SHOWN_KINDS} more"] if len(kinds) > _SHOWN_KINDS else []
+        told = "; ".join(kinds[:_SHOWN_KINDS] + more)
+        return [f"cost not known: fewer than five stored runs of {told}"]
+    lines = [f"CPU time {_interval(cost.cpu_s)}, by {cost.stored_runs} stored runs of its kind"]
+    workers = f"{cost.workers} worker{'' if cost.workers == 1 else 's'}"
+    return [*lines, "no worker now" if cost.wall_s is None else f"time {_interval(cost.wall_s)}, on {workers}"]
+
+
+def _interval(found: Interval) -> str:
+    return f"{duration(found.expected)} ({duration(found.low)} to {duration(found.high)})"
 
 
 def duration(seconds: float) -> str:

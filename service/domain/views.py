@@ -128,6 +128,10 @@ class RetriedGrid(GridView):
     """How many; in a grid that is paused they wait with the others."""
 
 
+GridKind = Literal["simulation", "measurement", "all"]
+"""Which grids a list has: those that were submitted, those of one run that measure an uploaded image, both."""
+
+
 class GridPage(_Answer):
     """A page of grids, newest first."""
 

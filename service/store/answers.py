@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -138,14 +139,25 @@ def biases(
     )
 
 
+# By grid, because an index of the runs has it in front: few grids are looked into, however many runs there are.
+_FAILED: tuple[ColumnElement[bool], ...] = (
+    run.c.grid_id.in_(select(grid.c.id).where(grid.c.state != "done")),
+    run.c.state.in_([literal_column(f"'{state}'") for state in (RunState.FAILED, RunState.QUARANTINED)]),
+)
+
+
+def failures_digest(connection: Connection) -> str:
+    """A digest that changes with the runs that failed or were quarantined: their index is read, and none of them."""
+    failed = select(run.c.grid_id, run.c.ordinal).where(*_FAILED).order_by(run.c.grid_id, run.c.ordinal)
+    digest = hashlib.sha256()
+    for grid_id, ordinal in connection.execute(failed):
+        digest.update(f"{grid_id} {ordinal}\n".encode())
+    return digest.hexdigest()
+
+
 def failures_by_group(connection: Connection, where: ResultFilter, groups: Grouping) -> tuple[IntArray, int]:
     """Runs that failed or were quarantined in each group, and those that would be in a group without any result."""
-    ended: tuple[ColumnElement[str], ...] = (
-        literal_column(f"'{RunState.FAILED}'"),
-        literal_column(f"'{RunState.QUARANTINED}'"),
-    )
     analysis = run.c.spec["analysis"]
-    # By grid, because an index of the runs has it in front: few grids are looked into, however many runs there are.
     failed = (
         select(
             run.c.grid_id,
@@ -155,7 +167,7 @@ def failures_by_group(connection: Connection, where: ResultFilter, groups: Group
             grid.c.engine_digest,
         )
         .join(grid, grid.c.id == run.c.grid_id)
-        .where(run.c.grid_id.in_(select(grid.c.id).where(grid.c.state != "done")), run.c.state.in_(ended))
+        .where(*_FAILED)
     )
     places = {values: number for number, values in enumerate(groups.values)}
     counted = np.zeros(len(groups.values), dtype=np.intp)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Row, literal_column, select
+from sqlalchemy import Row, select
 
-from service.domain.plan import IMAGE
 from service.domain.states import RunState
 from service.domain.views import UWS_PHASES, MeasurementPage, MeasurementView, RunError
 from service.store.database import Database
-from service.store.grids import WHOLE, NotFoundError
+from service.store.grids import IS_IMAGE, WHOLE, NotFoundError
 from service.store.tables import grid, measurement, run
 
-# Spelt out: a database takes a partial index only where it sees that the condition implies it.
-_IS_IMAGE = run.c.kind == literal_column(f"'{IMAGE}'")
 _SHORT = (
     grid.c.id,
     run.c.id.label("run_id"),
@@ -39,7 +36,7 @@ class MeasurementStore:
 
     def page(self, limit: int, before: str | None = None) -> MeasurementPage:
         """A page of measurements without what they found, newest first; ``next`` holds the cursor."""
-        wanted = select(*_SHORT).select_from(_SOURCE).where(_IS_IMAGE, WHOLE)
+        wanted = select(*_SHORT).select_from(_SOURCE).where(IS_IMAGE, WHOLE)
         if before is not None:
             wanted = wanted.where(run.c.grid_id < before)
         with self._database.read() as connection:
@@ -51,7 +48,7 @@ class MeasurementStore:
         """One with what it found; a NotFoundError where there is none."""
         wanted = select(*_SHORT, measurement.c.document).select_from(_SOURCE)
         with self._database.read() as connection:
-            row = connection.execute(wanted.where(run.c.grid_id == grid_id, _IS_IMAGE, WHOLE)).one_or_none()
+            row = connection.execute(wanted.where(run.c.grid_id == grid_id, IS_IMAGE, WHOLE)).one_or_none()
         if row is None:
             raise NotFoundError(f"there is no measurement {grid_id}")
         return _view(row, row.document)

@@ -10,7 +10,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
+from service.cli.formatting import dry_run_lines, duration
 from service.domain.requests import GridRequest, plan
+from service.domain.views import DryRun
 from service.runtime.settings import Settings
 from service.store.costs import CostStore
 from service.store.database import Database
@@ -67,6 +69,40 @@ def test_a_dry_run_tells_what_runs_of_its_kind_took(api: TestClient, database: D
     for other in ({"analysis": {"profile": "draft"}}, {"preset": None, "systems": ["SDSS1206"], "r_eff": [0.3]}):
         cost = api.post("/v1/grids?dry_run=true", json={**body(1), **other}).json()["cost"]
         assert (cost["cpu_s"], len(cost["unknown"])) == (None, 1), other
+
+
+def test_a_dry_run_tells_its_cost_by_page_and_by_command_and_says_where_nothing_is_known(
+    api: TestClient, database: Database
+) -> None:
+    filled = {"preset": "h0licow-vi/HE0435", "n": "2", "magnitude": "20.5", "l_eta": "1.0", "r_eff": "0.39"}
+
+    def shown() -> tuple[str, list[str]]:
+        page = api.post("/submit", data={**filled, "replicates": "10", "do": "check"})
+        assert page.status_code == 200, page.text
+        answer = api.post("/v1/grids?dry_run=true", json=body(10, seed=50))
+        return " ".join(page.text.split()), dry_run_lines(DryRun.model_validate(answer.json()))
+
+    page, lines = shown()
+    assert "not known: there are fewer than five stored runs of WFC3-IR_F160W, quad, standard." in page
+    assert lines[-1] == "cost not known: fewer than five stored runs of WFC3-IR_F160W, quad, standard"
+    api.post("/v1/grids", json=body(8))
+    work(database, 0, *[90.0] * 8)
+    page, lines = shown()
+    assert "It should take 15 min 0 s of CPU time (15 min 0 s to 15 min 0 s), and there is no worker now" in page
+    assert lines[-2:] == [
+        "CPU time 15 min 00 s (15 min 00 s to 15 min 00 s), by 8 stored runs of its kind",
+        "no worker now",
+    ]
+    api.post("/v1/grids", json=body(2, seed=100))
+    work(database, 3, 88.0, 92.0)
+    cost = api.post("/v1/grids?dry_run=true", json=body(10, seed=50)).json()["cost"]
+    page, lines = shown()
+    assert "10 stored runs" in page
+    assert "on the 3 workers that there are now" in page
+    for found, line in zip((cost["cpu_s"], cost["wall_s"]), lines[-2:], strict=True):
+        told = f"{duration(found['expected'])} ({duration(found['low'])} to {duration(found['high'])})"
+        assert told in line
+        assert found["low"] < found["expected"] < found["high"]
 
 
 def test_the_interval_covers_what_comes_as_often_as_it_says(api: TestClient, database: Database) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import case, update
 
 from service.api.app import create_app
 from service.domain.identifiers import utc_now
@@ -18,7 +19,8 @@ from service.store.database import Database
 from service.store.leadership import Leadership
 from service.store.queue import RunQueue
 from service.store.retention import Retention
-from tests.service.plans import body
+from service.store.tables import run
+from tests.service.plans import body, result_of
 from tests.service.tasks import PNG
 from tests.service.test_api import UNKNOWN_GRID, assert_problem, work
 
@@ -44,6 +46,17 @@ def tag_of(api: TestClient, address: str) -> str:
     assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
     assert api.get(address, headers={"If-None-Match": '"other"'}).status_code == 200
     return str(tag)
+
+
+def claim_and_store(settings: Settings, runs: int) -> None:
+    """Store so many of the runs that are queued."""
+    database = Database(settings.database)
+    generation = Leadership(database).take("worker", lambda _: True)
+    assert generation is not None
+    queue = RunQueue(database)
+    for lease in queue.claim(generation, runs):
+        queue.store(lease, result_of(lease))
+    database.close()
 
 
 def claim(settings: Settings) -> None:
@@ -86,6 +99,62 @@ def test_a_run_and_a_summary_have_another_tag_once_something_was_stored(api: Tes
     assert sum(Retention(database, utc_now()).prune("attempts")) == 2
     database.close()
     assert tag_of(api, run) != after[0]
+
+
+ANSWERS = (
+    "/v1/summary?group_by=n",
+    "/v1/trends?against=arc_magnitude",
+    "/v1/comparison?compare=estimator&left=image&right=paper",
+    "/v1/results?limit=1",
+)
+
+
+def test_answers_over_many_runs_have_another_tag_once_a_result_was_stored_that_they_mean(
+    api: TestClient, settings: Settings
+) -> None:
+    def tags() -> list[str]:
+        return [tag_of(api, address) for address in ANSWERS]
+
+    elsewhere = [f"{address}&system=none-such" for address in ANSWERS]
+    before, apart = tags(), [tag_of(api, address) for address in elsewhere]
+    assert len(set(before)) == len(ANSWERS)
+    api.post("/v1/grids", json=body(2))
+    assert tags() == before  # nothing is stored of it
+    work(settings)
+    first = tags()
+    assert not set(first) & set(before)
+    # One more of the same input, by another grid, and one more of an input that is there already.
+    grid = api.post("/v1/grids", json=body(2, seed=9)).json()["links"]
+    claim_and_store(settings, 1)
+    second = tags()
+    assert not set(second) & set(first)
+    work(settings)
+    third = tags()
+    assert not set(third) & set(second)
+    assert [tag_of(api, address) for address in elsewhere] == apart
+    assert tag_of(api, "/v1/results?limit=1&n=2") != third[3]
+    assert api.get(grid["self"]).json()["state"] == "done"
+
+
+def test_a_summary_has_another_tag_once_a_run_has_failed_and_once_it_is_tried_again(
+    api: TestClient, settings: Settings
+) -> None:
+    grid = api.post("/v1/grids", json=body(2)).json()["links"]
+    summary, rows = ANSWERS[0], ANSWERS[3]
+    before, of_rows = tag_of(api, summary), tag_of(api, rows)
+    database = Database(settings.database)
+    with database.write() as connection:
+        connection.execute(update(run).where(run.c.ordinal == 0).values(state="failed", error_code="x"))
+    failed = tag_of(api, summary)
+    with database.write() as connection:
+        connection.execute(update(run).values(state=case((run.c.ordinal == 0, "queued"), else_="failed")))
+    # As many failed as before, but not the same.
+    other = tag_of(api, summary)
+    database.close()
+    assert api.post(grid["retry"]).json()["retried"] == 1
+    assert len({before, failed, other}) == 3
+    assert tag_of(api, summary) == before
+    assert tag_of(api, rows) == of_rows
 
 
 def test_who_waits_for_a_grid_is_told_of_its_end(api: TestClient, settings: Settings) -> None:
@@ -157,4 +226,8 @@ def test_lists_have_a_short_form_with_the_same_pages(api: TestClient, settings: 
     assert [run["ordinal"] for run in runs["items"]] == [0, 1, 2]
     assert all(api.get(run["links"]["figure"]).content == PNG for run in runs["items"])
     waiting = api.get(second["links"]["runs"] + "?compact=true").json()["items"]
-    assert [(run["state"], run["links"].keys()) for run in waiting] == [("queued", {"self"})] * 2
+    assert [(run["state"], run["links"].keys()) for run in waiting] == [("queued", {"self", "page"})] * 2
+    # Each has a page for people, too.
+    for item in (second, *page["items"], *runs["items"], api.get(runs["items"][0]["links"]["self"]).json()):
+        assert api.get(item["links"]["page"]).headers["content-type"].startswith("text/html"), item
+        assert item["id"] in item["links"]["page"]

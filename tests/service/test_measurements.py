@@ -176,6 +176,20 @@ def test_measurements_and_grids_do_not_disturb_each_other(
     grid = api.post("/v1/grids", json={"preset": "h0licow-vi/HE0435", "n": [2], "magnitude": [20.5]}).json()
     work(settings)
     assert api.get(grid["links"]["self"]).json()["state"] == "done"
+
+    def listed(query: str) -> list[str]:
+        page = api.get(f"/v1/grids?limit=2{query}").json()
+        rest = api.get(page["next"]).json()["items"] if page["next"] else []
+        return [item["id"] for item in page["items"] + rest]
+
+    # Among the grids measurements are where somebody asks for them.
+    assert listed("") == listed("&compact=true") == listed("&kind=simulation") == [grid["id"]]
+    assert listed("&kind=measurement") == made[::-1]
+    assert listed("&kind=all") == [grid["id"], *made[::-1]]
+    assert_problem(api.get("/v1/grids?kind=image"), 422, "kind")
+    for address, shown in (("/", [grid["id"]]), ("/?kind=measurement", made), ("/?kind=all", [grid["id"], *made])):
+        text = api.get(address).text
+        assert [one for one in [grid["id"], *made] if f"/grids/{one}" in text] == shown, address
     assert_problem(api.get(f"{ADDRESS}/{grid['id']}"), 404)
     assert_problem(api.get(f"{ADDRESS}/{UNKNOWN_GRID}"), 404)
 

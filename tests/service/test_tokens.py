@@ -222,6 +222,19 @@ def test_the_login_page_shows_nothing_as_markup(api: TestClient) -> None:
     assert "<script>" not in text
 
 
+def test_the_login_page_looks_as_the_others_and_says_what_is_wrong(api: TestClient) -> None:
+    asked = api.get("/login", params={"next": "/grids/g"})
+    refused = api.post("/login", data={"token": "x", "next": "/grids/g"}, headers={"Accept": "text/html"})
+    for answer, status in ((asked, 200), (refused, 401)):
+        assert answer.status_code == status
+        assert '<a class="brand" href="/">hostlens</a>' in answer.text
+        assert 'name="next" value="/grids/g"' in answer.text
+        assert ("This token is not valid." in answer.text) == (status == 401)
+        assert answer.headers["cache-control"] == "no-store"
+        assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+    assert refused.headers["www-authenticate"] == 'Bearer realm="hostlens"'
+
+
 def test_a_malformed_login_is_refused_politely(api: TestClient) -> None:
     for content in (b"", b"token=", b"token=%ff", b"&" * 3000, b"token=x&" * 500, b"\xff\xfe"):
         answer = api.post("/login", content=content, headers={"Content-Type": "application/x-www-form-urlencoded"})

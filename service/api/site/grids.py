@@ -26,7 +26,7 @@ from service.api.threads import Route, patient
 from service.domain.identifiers import GRID_PATTERN
 from service.domain.payload import ESTIMATES, QUANTITIES, estimator_and_prior
 from service.domain.states import RunState
-from service.domain.views import GridView
+from service.domain.views import GridKind, GridView
 from service.figures.question import FigureKind
 from service.store.map_rows import map_runs, systems_of
 from service.store.result_rows import QUANTITY_UNITS
@@ -57,15 +57,22 @@ _FIGURES: tuple[tuple[FigureKind, str, str], ...] = (
 
 
 @router.get("/")
-def all_grids(service: Service, cursor: Annotated[str | None, Query(pattern=GRID_PATTERN)] = None) -> Response:
-    """Grids, newest first."""
-    found = service.grids.grids(_ON_A_PAGE, cursor)
+def all_grids(
+    service: Service,
+    cursor: Annotated[str | None, Query(pattern=GRID_PATTERN)] = None,
+    kind: GridKind = "simulation",
+) -> Response:
+    """Grids, newest first; those that measure uploaded images where they are asked for."""
+    found = service.grids.grids(_ON_A_PAGE, cursor, kind=kind)
+    asked = {} if kind == "simulation" else {"kind": kind}
+    here = asked | ({} if cursor is None else {"cursor": cursor})
     return page(
         "grids.html",
         here="/",
-        own="/" if cursor is None else f"/?cursor={cursor}",
+        own=f"/?{urlencode(here)}" if here else "/",
+        kind=kind,
         grids=found.items,
-        next=found.next,
+        next=found.next and f"/?{urlencode(asked | {'cursor': found.next})}",
         is_open=any(grid.finished_at is None for grid in found.items),
     )
 

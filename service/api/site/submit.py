@@ -85,7 +85,8 @@ def _take(service: Context, owner: str | None, typed: Mapping[str, str]) -> Resp
     if body is None or runs is None:
         return _page(fields, wrong=wrong, key=key, status=422)
     if typed.get("do") != "submit":
-        dry = {"n_runs": len(runs), "labels": [run.label for run in islice(runs, _SHOWN_LABELS)]}
+        labels = [run.label for run in islice(runs, _SHOWN_LABELS)]
+        dry = {"n_runs": len(runs), "labels": labels, "cost": service.costs.cost(runs.kinds())}
         return _page(fields, dry=dry)
     made = service.grids.create(
         body.canonical(),
