@@ -255,7 +255,6 @@ REFUSED = {
     "state not utf-8": Refused(http("GET", f"/v1/grids/{GRID}/runs?state=%ff"), 422, "state", "query"),
     # Addresses
     "nothing": Refused(http("GET", "/nothing"), 404),
-    "root": Refused(http("GET", "/"), 404),
     "upwards": Refused(http("GET", "/v1/systems/../grids"), 404),
     "encoded upwards": Refused(http("GET", "/v1/systems/%2e%2e%2fgrids"), 404),
     "encoded slash": Refused(http("GET", "/v1%2Fgrids%2F" + GRID + "%2F"), 404),
@@ -412,8 +411,6 @@ MALFORMED = {
     "space in target": (400, raw(b"GET /a b HTTP/1.1", HOST)),
     "no slash": (400, raw(b"GET healthz HTTP/1.1", HOST)),
     "raw bytes in target": (400, raw(b"GET /v1/systems/\xff HTTP/1.1", HOST)),
-    "address without a path": (404, raw(b"GET http://a HTTP/1.1", HOST, CLOSE)),
-    "address with a query alone": (404, raw(b"GET http://a?x=1 HTTP/1.1", HOST, CLOSE)),
     "address with no port": (400, raw(b"GET http://a:99999/healthz HTTP/1.1", HOST)),
     "asterisk": (404, raw(b"GET * HTTP/1.1", HOST, CLOSE)),
     "target of 33 kB": (414, raw(b"GET /" + b"x" * 33_000 + b" HTTP/1.1", HOST)),
@@ -461,6 +458,13 @@ MALFORMED = {
 def test_what_is_not_http_is_told_so_and_nothing_else_happens(server: Server, name: str) -> None:
     status, request = MALFORMED[name]
     assert_problem(ask(server, request), status)
+    assert answers(server)
+
+
+@pytest.mark.parametrize("target", [b"/", b"http://a"])
+def test_an_address_without_a_path_is_the_first_page(server: Server, target: bytes) -> None:
+    answer = ask(server, raw(b"GET " + target + b" HTTP/1.1", HOST, CLOSE))
+    assert answer.status == 200
     assert answers(server)
 
 

@@ -122,7 +122,8 @@ def test_a_grid_that_is_being_stored_is_nowhere_until_all_of_it_is(
     assert grids.grids(10).items == [made]
     assert depth.look().queued == 8
     assert len(queue.claim(generation, 10, "e" * 64)) == 8
-    assert [event.kind for event in events.page(made.id, 0, 10).items] == ["grid_submitted"]
+    kinds = [event.kind for event in events.page(made.id, 0, 10).items]
+    assert kinds == ["grid_submitted", *8 * ["run_started"]]
 
 
 def test_a_repeated_request_goes_on_where_the_first_one_stands(

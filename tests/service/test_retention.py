@@ -281,7 +281,7 @@ def test_nothing_is_deleted_without_a_yes(aged: str, service: Service, tmp_path:
     assert rows(service.database) == before
     agreed = run_command("--older-than", "90d", answer="y\n")
     assert agreed.exit_code == 0
-    assert rows(service.database) == (1, 0, 0)
+    assert rows(service.database) == (1, 0, 0, 0)
     assert not (tmp_path / "artefacts" / aged).exists()
 
 
