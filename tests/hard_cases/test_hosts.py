@@ -175,7 +175,7 @@ def test_agn_images_a_twentieth_of_an_arcsecond_apart_do_not_lead_the_host_astra
     Holds: the image estimator is right to 0.05 mag, though chi^2 shows that the pair is not described.
     """
     assert close.estimate("image", "wide").magnitude.bias == pytest.approx(0.0, abs=0.05)
-    assert close.chi2 / close.degrees_of_freedom < 2.5
+    assert 1.5 < close.chi2 / close.degrees_of_freedom < 2.5
 
 
 @pytest.mark.xfail(
@@ -188,8 +188,6 @@ def test_a_run_whose_model_does_not_describe_the_image_warns(close: RunResult) -
 
     Could go wrong: a result that no model describes looks like any other. Holds: a warning names chi^2.
     """
-    if close.chi2 / close.degrees_of_freedom < 1.5:
-        pytest.fail("the pair is described now: take another case")
     assert any("chi2" in warning for warning in close.warnings)
 
 
