@@ -60,9 +60,10 @@ from engine.grid import (
     expand,
     preset_names,
 )
-from engine.imaging.external import NoiseFromImage, observation_from_arrays
+from engine.imaging.external import observation_from_arrays
 from engine.imaging.external_files import read_external_observation
 from engine.imaging.fits import read_observation, write_observation
+from engine.imaging.noise_from_image import NoiseFromImage
 from engine.imaging.observation import Observation
 from engine.inspection import InversionView, inspect_inversion
 from engine.measure import ImageMeasurement, measure_image

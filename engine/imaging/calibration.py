@@ -57,8 +57,9 @@ class Given:
 
 @dataclass(frozen=True)
 class Calibration:
-    """``factor`` turns the image's unit into e-/s; ``zero_point`` is the AB magnitude of 1 e-/s."""
+    """``factor`` turns the image's ``unit`` into e-/s; ``zero_point`` is the AB magnitude of 1 e-/s."""
 
+    unit: units.UnitBase
     factor: float
     zero_point: float
     exposure_s: float | None
@@ -123,14 +124,13 @@ def calibrate(headers: Headers, given: Given, pixel_scale: float, found: Finding
     gain = _gain(headers, given, unit, found, needed=not in_flux or makes_noise)
     if in_flux:
         return _from_flux(headers, given, unit, seconds, gain, pixel_scale, found)
-    plain = units.electron if unit.is_equivalent(units.electron) else units.ct
-    plain = plain if total else plain / units.s
+    plain = next(kind for kind in _KINDS if _is(unit, kind))
     factor = float(unit.to(plain)) * (gain or 1.0) / (seconds if total and seconds else 1.0)
     stated = _stated_zero_point(headers)
     if stated is not None and gain:
         # It is that of 1 count/s, of which an electron is the gain's fraction.
         stated = (stated[0] + 2.5 * math.log10(gain), stated[1])
-    return Calibration(factor, _zero_point(given, stated, headers, found), seconds, electrons=True)
+    return Calibration(unit, factor, _zero_point(given, stated, headers, found), seconds, electrons=True)
 
 
 def _unit(headers: Headers, given: Given, found: Findings) -> units.UnitBase:
@@ -157,9 +157,7 @@ def _exposure(headers: Headers, given: Given, found: Findings, *, needed: bool, 
         found.read("exposure_s", float(given.exposure_s), "--exposure")
         return float(given.exposure_s)
     try:
-        stated = headers.number(*EXPOSURE)
-        if stated is not None and not stated[0] > 0:
-            raise ObservationError(f"{stated[1]}: got {stated[0]:g} s, allowed is a positive exposure")
+        stated = _stated_exposure(headers)
     except ObservationError as error:
         if needed:
             raise
@@ -176,9 +174,14 @@ def _exposure(headers: Headers, given: Given, found: Findings, *, needed: bool, 
     return stated[0]
 
 
-def _gain(
-    headers: Headers, given: Given, unit: units.UnitBase, found: Findings, *, needed: bool
-) -> float | None:
+def _stated_exposure(headers: Headers) -> tuple[float, str] | None:
+    stated = headers.number(*EXPOSURE)
+    if stated is not None and not stated[0] > 0:
+        raise ObservationError(f"{stated[1]}: got {stated[0]:g} s, allowed is a positive exposure")
+    return stated
+
+
+def _gain(headers: Headers, given: Given, unit: units.UnitBase, found: Findings, *, needed: bool) -> float | None:
     """Electrons in a count; None where the unit has them already, or where none is known or needed."""
     in_electrons = _is(unit, units.electron) or _is(unit, units.electron / units.s)
     if given.gain is not None:
@@ -269,4 +272,4 @@ def _from_flux(
     stated_zero_point = (float((rate * units.MJy).to_value(units.ABmag)), origin)
     zero_point = _zero_point(given, stated_zero_point, headers, found)
     electrons = response is not None and gain is not None
-    return Calibration(float(flux / rate), zero_point, seconds, electrons=electrons)
+    return Calibration(unit, float(flux / rate), zero_point, seconds, electrons=electrons)

@@ -1,5 +1,4 @@
-"""Which plane of anybody's FITS file is the image, its noise, its weight, its flags or the PSF, by the EXTNAMEs of
-HST, JWST and our own files."""
+"""Which plane of anybody's FITS file is the image, its noise, weight, flags or PSF: EXTNAMEs of HST, JWST and us."""
 
 from __future__ import annotations
 
@@ -132,9 +131,7 @@ class Plane:
             return np.asarray(self.hdu.section[(*leading, rows, columns)], dtype=np.float64)
 
 
-def find_plane(
-    hdus: fits.HDUList, path: str | Path, role: Role, extension: str | int | None = None
-) -> Plane | None:
+def find_plane(hdus: fits.HDUList, path: str | Path, role: Role, extension: str | int | None = None) -> Plane | None:
     """The plane of a role; None where no plane can have it.
 
     A plane is known by its EXTNAME. Where none is named after the role, it is the first that is not named after another
@@ -166,6 +163,16 @@ def find_plane(
     return Plane(hdu, Headers(tuple(sources)), (hdu.shape[-2], hdu.shape[-1]), len(chosen) - 1)
 
 
+def companion(hdus: fits.HDUList, path: str | Path, image: Plane, role: Role) -> Plane | None:
+    """The plane of a role that belongs to an image in the same file: of the same shape and EXTVER; None without one."""
+    for name in NAMES[role]:
+        for index, hdu in enumerate(hdus):
+            same = hdu is not image.hdu and _is_plane(hdu) and tuple(hdu.shape[-2:]) == image.shape
+            if same and hdu.name.upper() == name and hdu.ver == image.hdu.ver:
+                return find_plane(hdus, path, role, index)
+    return None
+
+
 def require_plane(hdus: fits.HDUList, path: str | Path, role: Role, extension: str | int | None = None) -> Plane:
     """The plane of a role; an ObservationError says what the file has instead."""
     plane = find_plane(hdus, path, role, extension)
@@ -185,9 +192,7 @@ def _is_plane(hdu: Any) -> bool:
 
 def _may_be(name: str, role: Role) -> bool:
     """Whether a plane of that EXTNAME may have a role after which it is not named."""
-    if role in ("dq", "weight"):
-        return False
     if role == "image":
         return name not in _NEVER_AN_IMAGE
     # A star cut out of an image makes a PSF; a noise map or a mask under a name of its own is taken, an image is not.
-    return name not in _NEVER_AN_IMAGE and (role == "psf" or name not in NAMES["image"])
+    return name not in _NEVER_AN_IMAGE and (role in ("psf", "valid", "dq") or name not in NAMES["image"])

@@ -44,7 +44,7 @@ def usable_by_mask(values: FloatArray, origin: str, found: Findings) -> NDArray[
     ObservationError
         It has more than two values, as flags have, or leaves so little that it is likely inside out.
     """
-    finite = np.isfinite(values)
+    finite: NDArray[np.bool_] = np.isfinite(values)
     kinds = np.unique(values[finite])
     if kinds.size > 2 or (kinds.size == 2 and not (kinds == 0).any()):
         few = ", ".join(f"{value:g}" for value in kinds[:4])
@@ -52,7 +52,7 @@ def usable_by_mask(values: FloatArray, origin: str, found: Findings) -> NDArray[
             f"{origin}: mask: got the values {few}{' ...' if kinds.size > 4 else ''}, allowed are 0 and one other "
             "where a pixel may be used; flags of bad pixels are given as dq"
         )
-    usable = finite & (values != 0)
+    usable: NDArray[np.bool_] = finite & (values != 0)
     _refuse_inside_out(usable, origin, "mask", "not zero where a pixel may be used", found)
     found.read("mask", f"{np.count_nonzero(~usable)} pixels out", origin)
     return usable
@@ -117,4 +117,4 @@ def _refuse_inside_out(usable: NDArray[np.bool_], origin: str, what: str, rule: 
     ny, nx = usable.shape
     middle = usable[ny // 4 : -(ny // 4) or None, nx // 4 : -(nx // 4) or None]
     if float(middle.mean()) < _MIDDLE * share:
-        found.note(f"{what}: {origin} leaves {middle.mean():.1%} of the middle of the image and {share:.1%} of the whole")
+        found.note(f"{what}: {origin} leaves {middle.mean():.1%} of the image's middle and {share:.1%} of the whole")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy import ndimage
 
@@ -10,6 +12,7 @@ from engine.errors import ObservationError
 
 _HOT, _HOT_LEAST = 4.0, 0.01
 """Times by which a hot pixel exceeds all its neighbours, and how much of the stamp's second brightest light it has."""
+_NO_PEAK = 0.5
 _PEDESTAL, _FLAT = 0.02, 0.8
 """Share of the light that a pedestal has to hold, and of the level further in that an edge has to have, to be one."""
 _WIDE_ENOUGH = 4.0
@@ -25,7 +28,7 @@ def width(psf: FloatArray) -> float:
     total, power = float(psf.sum()), float((psf**2).sum())
     if not (total > 0 and power > 0):
         raise ObservationError(f"psf: got the sum {total:g}, allowed is a positive one")
-    return _SIGMAS * total / np.sqrt(4.0 * np.pi * power)
+    return _SIGMAS * total / math.sqrt(4.0 * math.pi * power)
 
 
 def mended(psf: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
@@ -45,11 +48,13 @@ def mended(psf: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         return psf, ()
     notes = []
     neighbours = ndimage.maximum_filter(psf, footprint=_NEIGHBOURS, mode="constant", cval=-np.inf)
-    least = _HOT_LEAST * float(np.max(np.minimum(psf, neighbours)))
-    hot = (psf > _HOT * np.maximum(neighbours, 0.0)) & (psf > max(least, _noise(psf)))
+    core = float(np.max(np.minimum(psf, neighbours)))
+    hot = (psf > _HOT * np.maximum(neighbours, 0.0)) & (psf > max(_HOT_LEAST * core, _noise(psf)))
+    # A narrow peak has the brightest neighbours of all.
+    hot &= neighbours < _NO_PEAK * core
+    if not core > 0:
+        raise ObservationError("psf: all its light is in a single pixel")
     if hot.any():
-        if not least > 0:
-            raise ObservationError("psf: all its light is in a single pixel")
         smooth = ndimage.generic_filter(psf, np.median, footprint=_NEIGHBOURS, mode="reflect")
         first = np.argwhere(hot)[0]
         psf = np.where(hot, smooth, psf)

@@ -139,9 +139,9 @@ def cutout(
     else:
         with in_one_line(f"{world.origin}: its world coordinates cannot be used"):
             column, row = (float(value) for value in world.wcs.world_to_pixel(_sky(center)))
+    if not (math.isfinite(row) and math.isfinite(column)):
+        raise SpecError("center", " ".join(center or ()), "a place on the image")
     try:
-        if not (math.isfinite(row) and math.isfinite(column)):
-            raise NoOverlapError("not on the sky that it shows")
         (rows, columns), _ = overlap_slices(shape, (side, side), (round(row), round(column)), mode="trim")
     except NoOverlapError as error:
         raise SpecError("center", " ".join(center or ()), f"a place on the image ({said(error)})") from error
