@@ -25,7 +25,7 @@ _ALIASES = {
     "mjy": units.MJy,
 }
 _COUNTS = (units.adu, units.DN)
-POSSIBLE_ZERO_POINTS, _LIKELY_ZERO_POINTS = (0.0, 50.0), (15.0, 35.0)
+POSSIBLE_ZERO_POINTS, LIKELY_ZERO_POINTS = (0.0, 50.0), (15.0, 35.0)
 _AREA_AGREES, _AREA_WRONG, _ZERO_POINT_AGREES = 0.02, 0.25, 0.05
 _ST_ZERO_POINT = -21.1
 _SHORTEST_EXPOSURE = 2.0
@@ -229,7 +229,7 @@ def _zero_point(given: Given, stated: tuple[float, str] | None, headers: Headers
         value, origin = float(given.zero_point), "--zeropoint"
         if stated is not None and abs(stated[0] - value) > _ZERO_POINT_AGREES:
             found.note(f"zero_point: {value:.3f} is given and holds, {stated[1]} say {stated[0]:.3f}")
-    low, high = _LIKELY_ZERO_POINTS
+    low, high = LIKELY_ZERO_POINTS
     if not low <= value <= high:
         found.note(f"zero_point: {value:g} ({origin}) is unlikely for 1 e-/s, most lie from {low:g} to {high:g}")
     found.read("zero_point", value, origin)

@@ -1,0 +1,189 @@
+"""Whether an observation can be what it says: looked at before a fit, which would take minutes and hide the cause."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from engine.conventions import FloatArray, rate_to_magnitude
+from engine.errors import ObservationError, SpecError
+from engine.imaging.calibration import LIKELY_ZERO_POINTS, require_zero_point
+from engine.imaging.external_files import MOST_PIXELS
+from engine.imaging.observation import Observation
+from engine.imaging.psf_stamp import mended, same_picture, width
+from engine.imaging.readings import Findings
+from engine.parametric.detectability import why_no_lens
+
+_SMALLEST = 16
+"""Pixels along a side."""
+_LIKELY_SCALES, _POSSIBLE_SCALES = (0.005, 1.0), (0.001, 5.0)
+_LIKELY_WIDTHS, _POSSIBLE_WIDTHS = (0.03, 0.6), (0.005, 5.0)
+"""Of a pixel and of the PSF [arcsec]: from Keck's adaptive optics to the ground."""
+_LIKELY_MAGNITUDES = (13.5, 27.0)
+_LIKELY_SCATTER, _POSSIBLE_SCATTER = (0.3, 2.5), (0.05, 8.0)
+"""Of the empty sky over the noise map; drizzled images have 0.5 to 0.7."""
+_SKY_WINDOW, _FAINTEST_PERCENT, _FEWEST_PIXELS = 11, 25.0, 400
+_SHARP = 0.75
+"""Width of an image's sharpest peak over the PSF's from which on the PSF is too broad."""
+_PEAK_SIGNIFICANCE, _HOT_PIXEL = 30.0, 0.25
+_MOST_PEAKS = 6
+_CORE = 3
+
+
+def require_hints(
+    observation: Observation, theta_E: float | None, positions: Sequence[tuple[float, float]] | None
+) -> None:
+    """A SpecError where what is said of the lens is no number, or not on the image."""
+    half = [0.5 * n * observation.pixel_scale for n in reversed(observation.shape)]
+    if theta_E is not None and not (math.isfinite(theta_E) and 0 < theta_E < min(half)):
+        raise SpecError("theta_E", theta_E, f"a radius on the image, above 0 and below {min(half):g} arcsec")
+    for position in positions or ():
+        if not all(math.isfinite(value) and abs(value) <= reach for value, reach in zip(position, half, strict=True)):
+            raise SpecError(
+                "positions", tuple(position), f"a place on the image, within {half[0]:g} and {half[1]:g} arcsec"
+            )
+
+
+def require_lens(observation: Observation) -> None:
+    """An ObservationError where the image shows noise alone, one star, or one galaxy without an arc."""
+    reason = why_no_lens(observation)
+    if reason is not None:
+        raise ObservationError(f"image: {reason}, so there is no lens to measure")
+
+
+def unlikely(observation: Observation, *, trusting: bool = False) -> tuple[str, ...]:
+    """What is odd about an observation.
+
+    ``trusting``: what cannot be is told as well, instead of refused.
+
+    Raises
+    ------
+    ObservationError
+        Size, zero point, pixel scale, noise map or PSF cannot be those of this image.
+    """
+    found = Findings(trusting)
+    shape = observation.shape
+    if max(shape) > MOST_PIXELS:
+        raise ObservationError(f"image: got {shape[1]} x {shape[0]} pixels, allowed are {MOST_PIXELS} along a side")
+    if min(shape) < _SMALLEST:
+        raise ObservationError(f"image: got {shape[1]} x {shape[0]} pixels, a lens needs {_SMALLEST} along a side")
+    require_zero_point(observation.zero_point, "zero_point")
+    if not any(note.startswith("zero_point") for note in observation.notes):
+        _between(observation.zero_point, LIKELY_ZERO_POINTS, "zero_point", "mag for 1 e-/s", found)
+    _between(observation.pixel_scale, _LIKELY_SCALES, "pixel_scale", "arcsec a pixel", found, _POSSIBLE_SCALES)
+    _look_at_light(observation, found)
+    _look_at_noise(observation, found)
+    _look_at_psf(observation, found)
+    return tuple(found.notes)
+
+
+def _between(
+    value: float,
+    likely: tuple[float, float],
+    name: str,
+    unit: str,
+    found: Findings,
+    possible: tuple[float, float] = (-math.inf, math.inf),
+) -> None:
+    if not possible[0] <= value <= possible[1]:
+        found.contradict(f"{name}: got {value:.3g} {unit}, possible are {possible[0]:g} to {possible[1]:g}")
+    elif not likely[0] <= value <= likely[1]:
+        found.note(f"{name}: {value:.3g} {unit} are unlikely, most lie from {likely[0]:g} to {likely[1]:g}")
+
+
+def _look_at_light(observation: Observation, found: Findings) -> None:
+    """The magnitude of all light above the level of the image's border."""
+    image, valid = observation.image, observation.valid
+    border = valid.copy()
+    border[2:-2, 2:-2] = False
+    level = float(np.median(image[border])) if border.any() else float(np.percentile(image[valid], 10.0))
+    rate = float(np.sum(image[valid] - level))
+    if rate > 0:
+        magnitude = rate_to_magnitude(rate, observation.zero_point)
+        _between(magnitude, _LIKELY_MAGNITUDES, "image", "mag of all its light (unit, zero point)", found)
+
+
+def _look_at_noise(observation: Observation, found: Findings) -> None:
+    ratio = scatter_ratio(observation)
+    if ratio is None:
+        return
+    low, high = _POSSIBLE_SCATTER
+    if not low <= ratio <= high:
+        found.contradict(
+            f"noise: the sky scatters by {ratio:.3g} of its map, possible are {low:g} to {high:g}: is it 1 sigma, "
+            "and no variance or weight?"
+        )
+    elif not _LIKELY_SCATTER[0] <= ratio <= _LIKELY_SCATTER[1]:
+        found.note(f"noise: the sky scatters by {ratio:.2f} of its map")
+
+
+def scatter_ratio(observation: Observation) -> float | None:
+    """Scatter of the faintest quarter of an image over its noise map; None where there is too little of it."""
+    image, valid = observation.image, observation.valid
+    # What is masked has no bounds, and many mask by a noise beyond all measure.
+    usable = valid & (observation.noise < 100.0 * float(np.median(observation.noise[valid])))
+    if np.count_nonzero(usable) < _FEWEST_PIXELS:
+        return None
+    smooth = ndimage.median_filter(np.where(valid, image, float(np.median(image[valid]))), _SKY_WINDOW)
+    faint = usable & (smooth <= np.percentile(smooth[usable], _FAINTEST_PERCENT))
+    z = (image - smooth)[faint] / observation.noise[faint]
+    return 1.4826 * float(np.median(np.abs(z - np.median(z))))
+
+
+def _look_at_psf(observation: Observation, found: Findings) -> None:
+    psf = observation.psf
+    if same_picture(observation.image, psf):
+        found.contradict("psf: is the image itself")
+    try:
+        found.notes.extend(f"{note.replace(' is subtracted', '').replace(' are replaced', '')}" for note in _flaws(psf))
+    except ObservationError as error:
+        found.contradict(str(error))
+    pixels = width(np.maximum(psf, 0.0))
+    if pixels < 1.0:
+        found.note(f"psf: is {pixels:.2f} pixels wide, narrower than one")
+    _between(pixels * observation.pixel_scale, _LIKELY_WIDTHS, "psf", "arcsec wide", found, _POSSIBLE_WIDTHS)
+    sharpest = _sharpest_peak(observation)
+    if sharpest is not None and sharpest < _SHARP:
+        found.note(f"psf: the image has a peak of {sharpest:.2f} of its width: is it of these pixels and this filter?")
+
+
+def _flaws(psf: FloatArray) -> tuple[str, ...]:
+    return mended(psf)[1]
+
+
+def _sharpest_peak(observation: Observation) -> float | None:
+    """Width of the sharpest of the brightest peaks over that of the PSF, by their cores; None without a bright peak.
+
+    A hot pixel is no peak.
+    """
+    image = np.where(observation.valid, observation.image, np.nan)
+    filled = np.where(observation.valid, observation.image, float(np.median(observation.image[observation.valid])))
+    least = _PEAK_SIGNIFICANCE * np.where(observation.valid, observation.noise, np.inf)
+    tops = (filled == ndimage.maximum_filter(filled, 3)) & (filled - float(np.median(filled)) > least)
+    rows, columns = np.nonzero(tops)
+    if rows.size == 0:
+        return None
+    half = observation.psf.shape[0] // 2
+    if half < _CORE:
+        return None
+    own = _core_width(observation.psf[half - _CORE : half + _CORE + 1, half - _CORE : half + _CORE + 1])
+    widths = []
+    for k in np.argsort(-filled[rows, columns])[:_MOST_PEAKS]:
+        row, column = int(rows[k]), int(columns[k])
+        core = image[row - _CORE : row + _CORE + 1, column - _CORE : column + _CORE + 1]
+        if core.shape == (2 * _CORE + 1, 2 * _CORE + 1) and np.isfinite(core).all():
+            found = _core_width(core)
+            neighbours = np.sort(core[_CORE - 1 : _CORE + 2, _CORE - 1 : _CORE + 2].ravel())[:-1] - core.min()
+            if found is not None and neighbours.max() > _HOT_PIXEL * (core[_CORE, _CORE] - core.min()):
+                widths.append(found)
+    return None if not widths or own is None else min(widths) / own
+
+
+def _core_width(core: FloatArray) -> float | None:
+    """Width [pixels] of a peak by its noise-equivalent area above the level of the core's edge."""
+    edge = np.concatenate([core[0], core[-1], core[1:-1, 0], core[1:-1, -1]])
+    light = np.maximum(core - float(np.median(edge)), 0.0)
+    return width(light) if light.sum() > 0 else None
