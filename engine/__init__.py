@@ -65,6 +65,7 @@ from engine.imaging.external_files import read_external_observation
 from engine.imaging.fits import read_observation, write_observation
 from engine.imaging.noise_from_image import NoiseFromImage
 from engine.imaging.observation import Observation
+from engine.imaging.readings import Reading, readings
 from engine.inspection import InversionView, inspect_inversion
 from engine.measure import ImageMeasurement, measure_image
 from engine.result import (
@@ -148,6 +149,7 @@ __all__ = [
     "PullSummary",
     "Quantity",
     "Radii",
+    "Reading",
     "Realization",
     "Reconstruction",
     "Replicates",
@@ -196,6 +198,7 @@ __all__ = [
     "read_mapping",
     "read_observation",
     "read_system",
+    "readings",
     "realization_from_dict",
     "run",
     "serial_numbers",

@@ -30,7 +30,8 @@ _SHARP = 0.75
 """Width of an image's sharpest peak over the PSF's from which on the PSF is too broad."""
 _PEAK_SIGNIFICANCE, _HOT_PIXEL = 30.0, 0.25
 _MOST_PEAKS = 6
-_CORE = 3
+_CORES = (3, 12)
+"""Least and most pixels on either side of a peak that are its core; three quarters of a PSF's width between them."""
 
 
 def require_hints(
@@ -167,17 +168,20 @@ def _sharpest_peak(observation: Observation) -> float | None:
     if rows.size == 0:
         return None
     half = observation.psf.shape[0] // 2
-    if half < _CORE:
+    reach = int(np.clip(round(0.75 * width(np.maximum(observation.psf, 0.0))), *_CORES))
+    if half < reach:
         return None
-    own = _core_width(observation.psf[half - _CORE : half + _CORE + 1, half - _CORE : half + _CORE + 1])
+    own = _core_width(observation.psf[half - reach : half + reach + 1, half - reach : half + reach + 1])
     widths = []
     for k in np.argsort(-filled[rows, columns])[:_MOST_PEAKS]:
         row, column = int(rows[k]), int(columns[k])
-        core = image[row - _CORE : row + _CORE + 1, column - _CORE : column + _CORE + 1]
-        if core.shape == (2 * _CORE + 1, 2 * _CORE + 1) and np.isfinite(core).all():
+        if min(row, column, image.shape[0] - 1 - row, image.shape[1] - 1 - column) < reach:
+            continue
+        core = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
+        if np.isfinite(core).all():
             found = _core_width(core)
-            neighbours = np.sort(core[_CORE - 1 : _CORE + 2, _CORE - 1 : _CORE + 2].ravel())[:-1] - core.min()
-            if found is not None and neighbours.max() > _HOT_PIXEL * (core[_CORE, _CORE] - core.min()):
+            neighbours = np.sort(core[reach - 1 : reach + 2, reach - 1 : reach + 2].ravel())[:-1] - core.min()
+            if found is not None and neighbours.max() > _HOT_PIXEL * (core[reach, reach] - core.min()):
                 widths.append(found)
     return None if not widths or own is None else min(widths) / own
 

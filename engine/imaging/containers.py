@@ -63,14 +63,16 @@ def scalar(name: str, value: float | units.Quantity, unit: units.UnitBase) -> fl
     """A number in ``unit``, of one that has none or another."""
     if not isinstance(value, units.Quantity):
         return float(value)
-    for per in (units.dimensionless_unscaled, units.pix):
-        if (value.unit * per).is_equivalent(unit):
-            return float((value * per).to_value(unit))
+    if value.unit.is_equivalent(unit):
+        return float(value.to_value(unit))
+    # Logarithmic units divide by nothing.
+    if isinstance(unit, units.Unit | units.CompositeUnit) and value.unit.is_equivalent(unit / units.pix):
+        return float(value.to_value(unit / units.pix))
     raise ObservationError(f"{name}: got the unit {value.unit}, allowed is {unit}")
 
 
 def _factor(name: str, own: units.UnitBase, unit: units.UnitBase) -> float:
-    for per in (units.dimensionless_unscaled, units.pix):
-        if (own * per).is_equivalent(unit):
-            return float((own * per).to(unit))
+    for wanted in (unit, unit / units.pix):
+        if own.is_equivalent(wanted):
+            return float(own.to(wanted))
     raise ObservationError(f"{name}: got the unit {own or 'of a pure number'}, allowed is {unit}")

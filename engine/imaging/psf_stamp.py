@@ -100,11 +100,13 @@ def _pedestal(psf: FloatArray) -> float | None:
 
 
 def same_picture(one: FloatArray, other: FloatArray) -> bool:
-    """Whether two arrays show the same but for a factor, wherever both are finite."""
+    """Whether two arrays show the same but for a factor and a constant, wherever both are finite."""
     if one.shape != other.shape:
         return False
     both = np.isfinite(one) & np.isfinite(other)
-    a, b = one[both], other[both]
+    if not both.any():
+        return False
+    a, b = one[both] - np.median(one[both]), other[both] - np.median(other[both])
     power = float(a @ a)
     if not power > 0:
         return False

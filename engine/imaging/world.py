@@ -100,7 +100,7 @@ def place(world: World, row: float, column: float) -> Placement:
     scale = math.sqrt(abs(float(np.linalg.det(matrix)))) if np.isfinite(matrix).all() else math.nan
     if not 0 < scale < _LARGEST_PIXEL:
         raise ObservationError(
-            f"{world.origin}: its world coordinates have {scale:g} arcsec a pixel: is CDELT or CD missing?"
+            f"{world.origin}: its world coordinates have {scale:.4g} arcsec a pixel: is CDELT or CD missing?"
         )
     unsquare = _unsquare(matrix)
     if unsquare > _HARDLY_SQUARE:
