@@ -8,7 +8,10 @@ from importlib import import_module
 gc.disable()
 for name in ("distributed.nanny", "distributed.worker", "service.runtime.logs", "service.worker.tasks", "engine"):
     try:
-        import_module(name)
+        found = import_module(name)
+        for late in getattr(found, "__all__", ()):
+            # The engine loads what computes when its name is first used: here, and not in each worker.
+            getattr(found, late)
     except Exception:
         # Each worker tries again when it is greeted, and its answer tells the dispatcher what is wrong.
         logging.getLogger(__name__).exception("%s cannot be loaded", name)

@@ -8,7 +8,7 @@ import re
 import pytest
 from pydantic_core import PydanticUndefined
 
-from engine.analyse import POOR_FIT
+from engine.reconstruction import POOR_FIT
 from engine.parametric.constraints import (
     CENTRE_PRIOR,
     ELLIPTICITY_PRIOR,
