@@ -3,7 +3,7 @@
 ``python -m benchmarks.api_load`` starts a real API over a database with a grid of 3,000 runs that another process
 finishes at 20 a second, checks what each address answers, and then asks from 50 keep-alive connections, each as fast as
 it is answered. The client is one process that does nothing but send prepared bytes and find the end of the answer.
-What waits for a thread is read once for all who ask for it, so that 50 runs, one for each connection, cost more than one.
+What waits for a thread is read once for all who ask for it: 50 runs, one for each connection, cost more than one.
 CPU per request counts all API processes; unlike the latencies it does not depend on what else the machine does.
 
 ``--against FOLDER`` measures another checkout in the same run; ``--streams N`` holds so many event streams open
