@@ -68,17 +68,17 @@ def measure(
         if path is not None:
             require_file(path, kinds)
     require_readable(inputs)
+    where = _positions(positions)
     with refusals():
         from rich.console import Console  # noqa: PLC0415 - help needs none
-
-        from engine import measure_image, readings  # noqa: PLC0415 - the engine takes seconds to load
 
         observation = _observation(
             image, psf, trust_options=trust_options, noise=noise, pixel_scale=pixel_scale, zero_point=zeropoint,
             mask=mask, dq=dq, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation,
             sky_rms_e_s=sky_rms, good_bits=good_bits, center=center, size=size, extension=extension,
         )  # fmt: skip
-        where = _positions(positions)
+        from engine import measure_image, readings  # noqa: PLC0415 - seconds, which only an image is worth
+
         for reading in readings(observation):
             typer.echo(f"read.{reading.name:12s} {_short(reading.value)}  ({reading.origin})")
         console = Console(stderr=True)
@@ -105,30 +105,38 @@ def _short(value: str | float) -> str:
 
 def _observation(image: Path, psf: Path | None, *, trust_options: bool, **how: Any) -> Observation:
     """Our own FITS file as it is, or anybody's from its parts; ``how`` is None where nothing is given."""
-    from astropy.io import fits  # noqa: PLC0415 - as the engine
-
-    from engine import ObservationError, read_external_observation, read_observation  # noqa: PLC0415
-
     if psf is None:
-        try:
-            own = "HOSTLENS" in fits.getheader(image)
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise ObservationError(f"{image}: not a FITS file that can be read ({error})") from error
-        if own:
-            names = {"zero_point": "zeropoint"}
-            given = [names.get(name, name) for name, value in how.items() if value is not None]
-            extra = ", ".join(f"--{name.removesuffix('_e_s').removesuffix('_s').replace('_', '-')}" for name in given)
-            if extra:
-                raise typer.BadParameter(f"{image} has its own noise map, PSF and zero point in it: leave out {extra}")
-            return read_observation(image)
-        raise typer.BadParameter(f"--psf: {image} is not of `hostlens simulate`, so a PSF must be given")
+        return _own_observation(image, [name for name, value in how.items() if value is not None])
     if how["unit"] not in (None, *_UNITS):
         raise typer.BadParameter(f"--unit: got {how['unit']!r}, allowed is one of {', '.join(_UNITS)}")
+    from engine import read_external_observation  # noqa: PLC0415 - seconds, which only right options are worth
+
     return read_external_observation(
         image, psf, recentre_psf="pixel", normalise_psf=True, mend_psf=True, trust_options=trust_options, **how
     )
+
+
+def _own_observation(image: Path, told: list[str]) -> Observation:
+    """An observation of ours, of which nothing may be ``told``: parameters of the reader, as ``exposure_s``."""
+    from astropy.io import fits  # noqa: PLC0415 - as the engine
+
+    from engine import ObservationError  # noqa: PLC0415
+
+    try:
+        own = "HOSTLENS" in fits.getheader(image)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ObservationError(f"{image}: not a FITS file that can be read ({error})") from error
+    if not own:
+        raise typer.BadParameter(f"--psf: {image} is not of `hostlens simulate`, so a PSF must be given")
+    if told:
+        plain = (name.replace("zero_point", "zeropoint").removesuffix("_e_s").removesuffix("_s") for name in told)
+        extra = ", ".join(f"--{name.replace('_', '-')}" for name in plain)
+        raise typer.BadParameter(f"{image} has its own noise map, PSF and zero point in it: leave out {extra}")
+    from engine import read_observation  # noqa: PLC0415 - as above
+
+    return read_observation(image)
 
 
 def _positions(given: list[str] | None) -> list[tuple[float, float]] | None:
