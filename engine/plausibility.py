@@ -13,6 +13,7 @@ from engine.errors import ObservationError, SpecError
 from engine.imaging.calibration import LIKELY_ZERO_POINTS, require_zero_point
 from engine.imaging.external_files import MOST_PIXELS
 from engine.imaging.observation import Observation
+from engine.imaging.optics.spline import place_stamp
 from engine.imaging.psf_stamp import mended, same_picture, width
 from engine.imaging.readings import Findings
 from engine.parametric.detectability import why_no_lens
@@ -26,12 +27,9 @@ _LIKELY_MAGNITUDES = (13.5, 27.0)
 _LIKELY_SCATTER, _POSSIBLE_SCATTER = (0.3, 2.5), (0.05, 8.0)
 """Of the empty sky over the noise map; drizzled images have 0.5 to 0.7."""
 _SKY_WINDOW, _FAINTEST_PERCENT, _FEWEST_PIXELS = 11, 25.0, 400
-_SHARP = 0.75
-"""Width of an image's sharpest peak over the PSF's from which on the PSF is too broad."""
-_PEAK_SIGNIFICANCE, _HOT_PIXEL = 30.0, 0.25
-_MOST_PEAKS = 6
-_CORES = (3, 12)
-"""Least and most pixels on either side of a peak that are its core; three quarters of a PSF's width between them."""
+_SHARP = 1.3
+"""Sharpness of an image's sharpest peak over the PSF's from which on the PSF is too broad."""
+_PEAK_SIGNIFICANCE, _HOT_PIXEL, _MOST_PEAKS, _PHASES = 60.0, 0.25, 6, 9
 
 
 def require_hints(
@@ -146,48 +144,41 @@ def _look_at_psf(observation: Observation, found: Findings) -> None:
     if pixels < 1.0:
         found.note(f"psf: is {pixels:.2f} pixels wide, narrower than one")
     _between(pixels * observation.pixel_scale, _LIKELY_WIDTHS, "psf", "arcsec wide", found, _POSSIBLE_WIDTHS)
-    sharpest = _sharpest_peak(observation)
-    if sharpest is not None and sharpest < _SHARP:
-        found.note(f"psf: the image has a peak of {sharpest:.2f} of its width: is it of these pixels and this filter?")
+    sharpest = sharpest_peak(observation)
+    if sharpest is not None and sharpest > _SHARP:
+        found.note(f"psf: the image has a peak {sharpest:.1f} times as sharp: is it of these pixels and this filter?")
 
 
 def _flaws(psf: FloatArray) -> tuple[str, ...]:
     return mended(psf)[1]
 
 
-def _sharpest_peak(observation: Observation) -> float | None:
-    """Width of the sharpest of the brightest peaks over that of the PSF, by their cores; None without a bright peak.
+def sharpest_peak(observation: Observation) -> float | None:
+    """Sharpness of the sharpest of the brightest peaks over the most that the PSF can have; None without such a peak.
 
-    A hot pixel is no peak.
+    The sharpness of a pixel is what its four neighbours fall short of it, over its height above the sky. Whatever else
+    shines there makes it less, and so does a place between the pixels. A hot pixel is no peak.
     """
-    image = np.where(observation.valid, observation.image, np.nan)
-    filled = np.where(observation.valid, observation.image, float(np.median(observation.image[observation.valid])))
-    least = _PEAK_SIGNIFICANCE * np.where(observation.valid, observation.noise, np.inf)
-    tops = (filled == ndimage.maximum_filter(filled, 3)) & (filled - float(np.median(filled)) > least)
-    rows, columns = np.nonzero(tops)
-    if rows.size == 0:
-        return None
-    half = observation.psf.shape[0] // 2
-    reach = int(np.clip(round(0.75 * width(np.maximum(observation.psf, 0.0))), *_CORES))
-    if half < reach:
-        return None
-    own = _core_width(observation.psf[half - reach : half + reach + 1, half - reach : half + reach + 1])
-    widths = []
-    for k in np.argsort(-filled[rows, columns])[:_MOST_PEAKS]:
-        row, column = int(rows[k]), int(columns[k])
-        if min(row, column, image.shape[0] - 1 - row, image.shape[1] - 1 - column) < reach:
-            continue
-        core = image[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        if np.isfinite(core).all():
-            found = _core_width(core)
-            neighbours = np.sort(core[reach - 1 : reach + 2, reach - 1 : reach + 2].ravel())[:-1] - core.min()
-            if found is not None and neighbours.max() > _HOT_PIXEL * (core[reach, reach] - core.min()):
-                widths.append(found)
-    return None if not widths or own is None else min(widths) / own
+    valid, sky = observation.valid, float(np.median(observation.image[observation.valid]))
+    image = np.where(valid, observation.image - sky, 0.0)
+    significant = image > _PEAK_SIGNIFICANCE * np.where(valid, observation.noise, np.inf)
+    whole = ndimage.binary_erosion(valid, np.ones((3, 3), dtype=bool))
+    rows, columns = np.nonzero((image == ndimage.maximum_filter(image, 3)) & significant & whole)
+    sharp = []
+    for k in np.argsort(-image[rows, columns])[:_MOST_PEAKS]:
+        core = image[rows[k] - 1 : rows[k] + 2, columns[k] - 1 : columns[k] + 2]
+        if np.sort(core.ravel())[-2] > _HOT_PIXEL * core[1, 1]:
+            sharp.append(_sharpness(core))
+    return max(sharp) / _psf_sharpness(observation.psf) if sharp else None
 
 
-def _core_width(core: FloatArray) -> float | None:
-    """Width [pixels] of a peak by its noise-equivalent area above the level of the core's edge."""
-    edge = np.concatenate([core[0], core[-1], core[1:-1, 0], core[1:-1, -1]])
-    light = np.maximum(core - float(np.median(edge)), 0.0)
-    return width(light) if light.sum() > 0 else None
+def _psf_sharpness(psf: FloatArray) -> float:
+    """The largest sharpness of a PSF over where it may stand in its pixel."""
+    places = np.linspace(-0.5, 0.5, _PHASES)
+    moved = [place_stamp(psf, (3, 3), 1.0 + dx, 1.0 + dy) for dx in places for dy in places]
+    return max(_sharpness(core) for core in moved if core[1, 1] == core.max())
+
+
+def _sharpness(core: FloatArray) -> float:
+    around = float(core[0, 1] + core[2, 1] + core[1, 0] + core[1, 2])
+    return 4.0 - around / float(core[1, 1])
