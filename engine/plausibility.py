@@ -146,7 +146,7 @@ def _look_at_psf(observation: Observation, found: Findings) -> None:
     _between(pixels * observation.pixel_scale, _LIKELY_WIDTHS, "psf", "arcsec wide", found, _POSSIBLE_WIDTHS)
     sharpest = sharpest_peak(observation)
     if sharpest is not None and sharpest > _SHARP:
-        found.note(f"psf: the image has a peak {sharpest:.1f} times as sharp: is it of these pixels and this filter?")
+        found.note(f"psf: the image has a peak {sharpest:.1f} times as sharp: is it oversampled, or another filter's?")
 
 
 def _flaws(psf: FloatArray) -> tuple[str, ...]:

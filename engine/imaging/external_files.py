@@ -25,7 +25,7 @@ from engine.imaging.flags import usable_by_flags, usable_by_mask
 from engine.imaging.noise_from_image import NoiseFromImage, drizzle_correlation
 from engine.imaging.observation import Observation
 from engine.imaging.psf_centre import PsfCentre
-from engine.imaging.psf_stamp import same_picture
+from engine.imaging.psf_stamp import binned, same_picture
 from engine.imaging.readings import Findings, recorded
 from engine.imaging.world import Placement, World, cutout, place, read_world
 
@@ -78,6 +78,7 @@ def read_external_observation(
     recentre_psf: PsfCentre | None = None,
     normalise_psf: bool = False,
     mend_psf: bool = False,
+    psf_oversampling: int | None = None,
     trust_options: bool = False,
 ) -> Observation:
     """Read an observation that somebody else made; planes are known by EXTNAME (:mod:`.fits_planes`).
@@ -113,6 +114,8 @@ def read_external_observation(
         Name or number of the image's plane, where the file has several.
     recentre_psf, normalise_psf, mend_psf
         What may be done to the PSF; see :func:`~engine.imaging.external.observation_from_arrays`.
+    psf_oversampling
+        How many times as finely as the image the PSF is sampled; where None what its own pixel scale says, or once.
     trust_options
         Go on where what is given and what the files say exclude each other, or a file cannot be what it is given for.
 
@@ -148,7 +151,7 @@ def read_external_observation(
         sigma = _noise_map(noise, science, given, found)
     else:
         sigma = _made_noise(science, given, found) if science.noise is None else science.noise
-    stamp = _psf(psf, science, found)
+    stamp = _psf(psf, science, psf_oversampling, found)
     usable = [] if science.good is None else [science.good]
     roles: tuple[tuple[str | Path | None, Literal["valid", "dq"]], ...] = ((mask, "valid"), (dq, "dq"))
     usable += [_usable(path, role, science, good_bits, found) for path, role in roles if path is not None]
@@ -332,8 +335,8 @@ def _correlation(headers: Headers, pixel_scale: float, found: Findings) -> float
     return factor
 
 
-def _psf(path: str | Path, science: _Science, found: Findings) -> FloatArray:
-    """The PSF's stamp as it is; the image in its place, or other pixels than the image's, are refused."""
+def _psf(path: str | Path, science: _Science, oversampling: int | None, found: Findings) -> FloatArray:
+    """The PSF's stamp on the image's pixels; the image in its place, or pixels that do not fit them, are refused."""
     with opened(path) as hdus:
         plane = require_plane(hdus, path, "psf")
         if max(plane.shape) > MOST_PIXELS:
@@ -353,10 +356,17 @@ def _psf(path: str | Path, science: _Science, found: Findings) -> FloatArray:
                 stated = None
     if same_picture(science.values, values):
         found.contradict(f"{plane.origin}: psf: is the image itself")
-    if stated is not None and abs(stated[0] / science.pixel_scale - 1.0) > _PSF_SCALE_AGREES:
+    factor, origin = (1, "") if oversampling is None else (oversampling, "--psf-oversampling")
+    if stated is not None and stated[0] > 0 and oversampling is None:
+        factor, origin = max(1, round(science.pixel_scale / stated[0])), stated[1]
+    if stated is not None and abs(factor * stated[0] / science.pixel_scale - 1.0) > _PSF_SCALE_AGREES:
         found.contradict(f"psf: {stated[1]} says {stated[0]:.4g} arcsec a pixel, the image {science.pixel_scale:.4g}")
     found.read("psf", f"{plane.shape[1]} x {plane.shape[0]} pixels", plane.origin)
-    return values
+    if factor != 1:
+        if not np.isfinite(values).all():
+            raise ObservationError(f"{plane.origin}: psf: not finite everywhere")
+        found.read("psf_oversampling", factor, origin)
+    return binned(values, factor)
 
 
 def _usable(

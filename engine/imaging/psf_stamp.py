@@ -20,6 +20,7 @@ _WIDE_ENOUGH = 4.0
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
 _SMALLEST = 5
 _SIGMAS = 2.3548
+_FINEST = 16
 _SAME = 1e-3
 
 
@@ -97,6 +98,27 @@ def _pedestal(psf: FloatArray) -> float | None:
     radius = np.hypot(y - peak_row, x - peak_column)
     further_in = float(np.median(psf[(radius > 0.6 * away) & (radius < 0.75 * away)]))
     return level if level < 0 or level > _FLAT * further_in else None
+
+
+def binned(psf: FloatArray, factor: int) -> FloatArray:
+    """A PSF that is sampled ``factor`` times as finely as the image, on the image's pixels.
+
+    Its brightest pixel, which becomes the middle of an odd square, stands in the middle of a pixel of the image. Light
+    is summed over pixels; an even number of fine ones has half of its outermost on either side.
+    """
+    if not 1 <= factor <= _FINEST:
+        raise ObservationError(f"psf_oversampling: got {factor}, allowed is a whole number from 1 to {_FINEST}")
+    if factor == 1:
+        return psf
+    row, column = np.unravel_index(int(np.argmax(psf)), psf.shape)
+    ny, nx = psf.shape
+    half = factor * -(-max(row, ny - 1 - row, column, nx - 1 - column) // factor)
+    centred = np.zeros((2 * half + 1, 2 * half + 1))
+    centred[half - row : half - row + ny, half - column : half - column + nx] = psf
+    box = np.ones(factor) if factor % 2 else np.concatenate([[0.5], np.ones(factor - 1), [0.5]])
+    for axis in (0, 1):
+        centred = ndimage.convolve1d(centred, box, axis=axis, mode="constant")
+    return np.ascontiguousarray(centred[::factor, ::factor])
 
 
 def same_picture(one: FloatArray, other: FloatArray) -> bool:

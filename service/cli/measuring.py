@@ -47,6 +47,9 @@ def measure(
     saturation: Annotated[float | None, typer.Option(help="e-/s of a saturated pixel")] = None,
     sky_rms: Annotated[float | None, typer.Option(help="e-/s of the empty sky's noise; without --noise only")] = None,
     mask: Annotated[Path | None, typer.Option(help="FITS, not zero where a pixel may be used")] = None,
+    psf_oversampling: Annotated[
+        int | None, typer.Option(help="How many times as finely as the image the PSF is sampled")
+    ] = None,
     dq: Annotated[Path | None, typer.Option(help="FITS, flags of bad pixels; the image's DQ without")] = None,
     good_bits: Annotated[str | None, typer.Option(help="Flags that do no harm, as 64,512 or WARM,HOT")] = None,
     center: Annotated[tuple[str, str] | None, typer.Option(help="RA Dec to cut the image out by")] = None,
@@ -76,6 +79,7 @@ def measure(
             image, psf, trust_options=trust_options, noise=noise, pixel_scale=pixel_scale, zero_point=zeropoint,
             mask=mask, dq=dq, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation,
             sky_rms_e_s=sky_rms, good_bits=good_bits, center=center, size=size, extension=extension,
+            psf_oversampling=psf_oversampling,
         )  # fmt: skip
         from engine import measure_image, readings  # noqa: PLC0415 - seconds, which only an image is worth
 

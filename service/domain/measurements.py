@@ -12,7 +12,7 @@ from service.domain.plan import IMAGE, PlannedRun
 FILES = ("image", "noise", "psf", "mask", "dq")
 _OF_OURS = (
     "pixel_scale", "zeropoint", "unit", "exposure", "gain", "saturation", "sky_rms", "good_bits", "center", "size",
-    "extension",
+    "extension", "psf_oversampling",
 )  # fmt: skip
 """What an observation of ``hostlens simulate`` has in its own file."""
 
@@ -43,6 +43,8 @@ class MeasurementOptions(BaseModel):
     """[e-/s]."""
     good_bits: Text | None = None
     """Flags that do no harm, as 64,512."""
+    psf_oversampling: Annotated[int, Field(ge=1, le=16)] | None = None
+    """How many times as finely as the image the PSF is sampled; what its own pixel scale says without."""
     center: Place | None = None
     """RA,Dec to cut the image out by, with ``size``."""
     size: Positive | None = None

@@ -85,6 +85,7 @@ def _observation(files: dict[str, Path], options: dict[str, Any]) -> Observation
         center=None if options["center"] is None else (center[0].strip(), center[2].strip()),
         size=options["size"],
         extension=options["extension"],
+        psf_oversampling=options["psf_oversampling"],
         trust_options=options["trust_options"],
         recentre_psf="pixel",
         normalise_psf=True,

@@ -364,9 +364,29 @@ def test_our_own_file_as_psf_gives_its_psf(files: Files) -> None:
 def test_a_psf_on_other_pixels_or_the_image_as_psf_are_refused(files: Files) -> None:
     with pytest.raises(ObservationError, match="psf: is the image itself"):
         files.read(psf=files.write())
-    files.psf_header = fits.Header({"PIXELSCL": 0.0125})
-    with pytest.raises(ObservationError, match=r"psf: PIXELSCL of psf.fits\[0\] says 0.0125 arcsec a pixel"):
-        files.read()
+    for scale in (0.03, 0.1):
+        files.psf_header = fits.Header({"PIXELSCL": scale})
+        with pytest.raises(ObservationError, match=rf"psf: PIXELSCL of psf.fits\[0\] says {scale} arcsec a pixel"):
+            files.read()
+
+
+@pytest.mark.parametrize("factor", [2, 3, 4])
+def test_an_oversampled_psf_comes_to_the_pixels_of_the_image(files: Files, factor: int) -> None:
+    # A Gaussian of 1.5 pixels, integrated over pixels by the error function.
+    edges = (np.arange(22) - 10.5) / (1.5 * math.sqrt(2.0))
+    mean = np.diff([math.erf(edge) for edge in edges])
+    true = np.outer(mean, mean) / mean.sum() ** 2
+    side = 21 * factor - (factor % 2 == 0)
+    files.psf = gaussian((side, side), side // 2, side // 2, 1.5 * factor)
+    files.psf_header = fits.Header({"PIXELSCL": SCALE / factor})
+    seen = files.read()
+    # Sums over fine pixels for integrals: the midpoint rule, or the trapezoidal one, whose errors go with their square.
+    np.testing.assert_allclose(seen.psf, np.pad(true, (seen.psf.shape[0] - 21) // 2), atol=1.5e-3 / (factor / 2) ** 2)
+    assert told(seen, "psf_oversampling") == Reading("psf_oversampling", factor, "PIXELSCL of psf.fits[0]")
+    files.psf_header = None
+    np.testing.assert_array_equal(files.read(psf_oversampling=factor).psf, seen.psf)
+    with pytest.raises(ObservationError, match="psf_oversampling: got 0"):
+        files.read(psf_oversampling=0)
 
 
 def test_a_hot_pixel_and_a_pedestal_are_taken_out_of_a_psf_and_told(files: Files) -> None:
