@@ -7,7 +7,7 @@ is looked at on the scale of the PSF and on larger ones. In doubt the image may 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ _STAR_ERROR, _MIRROR_ERROR, _GALAXY_ERROR = 0.05, 0.1, 0.005
 _WINDOW = 40
 """Pixels on either side of the peak within which a star or a galaxy is fitted."""
 _EVALUATIONS = 15
+_FEWEST_TELLING = 400
 _TO_SIGMA = 1.4826
 _LOW, _HIGH = np.array([math.log(0.02), 0.4, -0.7, -0.7]), np.array([math.log(20.0), 8.0, 0.7, 0.7])
 
@@ -59,7 +60,8 @@ def why_no_lens(observation: Observation) -> str | None:
     mirrored = _mirrored(part.image)
     off = np.abs(part.image) + np.abs(mirrored)
     # A galaxy is fitted only where what is seen has its symmetry: fits take seconds.
-    if not _stands_out(part.image - mirrored, part, part.variance + (_MIRROR_ERROR * off) ** 2, sigma):
+    difference = replace(part, variance=2.0 * part.variance)
+    if not _stands_out(part.image - mirrored, difference, (_MIRROR_ERROR * off) ** 2, sigma):
         shape = _galaxy(part) + np.concatenate([np.zeros(4), offset])
         galaxy, rest = _scaled(whole, optics.sersic_image(profile_of(shape)))
         if not _stands_out(rest, whole, (_GALAXY_ERROR * galaxy) ** 2, sigma):
@@ -72,12 +74,15 @@ def _stands_out(residual: FloatArray, seen: _Seen, error: FloatArray | float, si
     valid = seen.valid
     z = residual / np.sqrt(seen.variance + error)
     z = np.where(valid, z - np.median(z[valid]), 0.0)
+    # Where the error of what was taken off is most of the variance, the scatter is less than it.
+    noisy = valid & (error < seen.variance)
+    telling = noisy if np.count_nonzero(noisy) > _FEWEST_TELLING else valid
     for scale in _SCALES:
         smooth = ndimage.gaussian_filter(z, scale * sigma, mode="constant")
-        inside = smooth[valid]
-        inside = inside - np.median(inside)
-        by_scatter = float(inside.max()) / max(_TO_SIGMA * float(np.median(np.abs(inside))), 1e-300)
-        by_map = float(inside.max()) * 2.0 * math.sqrt(math.pi) * scale * sigma
+        level = float(np.median(smooth[telling]))
+        highest = float(smooth[valid].max()) - level
+        by_scatter = highest / max(_TO_SIGMA * float(np.median(np.abs(smooth[telling] - level))), 1e-300)
+        by_map = highest * 2.0 * math.sqrt(math.pi) * scale * sigma
         if (by_scatter > _STANDS_OUT and by_map > _OF_MAP) or by_map > _FAR_OUT_OF_MAP:
             return True
     return False

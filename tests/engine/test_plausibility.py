@@ -6,7 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine import ObservationError, SpecError, measure_image
+from engine import (
+    Host,
+    ObservationError,
+    Realization,
+    SpecError,
+    load_system,
+    measure_image,
+    simulate_realization,
+)
 from engine.imaging.observation import Observation
 from engine.imaging.optics.stamp import StampOptics
 from engine.light.sersic import SersicProfile
@@ -49,6 +57,16 @@ def test_noise_alone_one_star_and_a_galaxy_without_an_arc_are_no_lens() -> None:
         assert said in (why_no_lens(observation) or "")
         with pytest.raises(ObservationError, match=f"image: {said}.*no lens to measure"):
             measure_image(observation, inversion=False)
+
+
+def test_a_drizzled_deflector_is_no_lens_until_an_arc_is_behind_it() -> None:
+    # Its pixels share noise, its noise map allows for that, and its core is not the moved stamp of its PSF.
+    system = replace(load_system("HE0435"), agn=())
+    for magnitude, said in ((32.0, "one galaxy"), (24.5, None)):
+        spec = Realization(system=system, l_eta=1.0, host=Host(n=2.0, r_eff=0.3, magnitude=magnitude))
+        observation = replace(simulate_realization(spec).observation, response=None, covariance=None)
+        reason = why_no_lens(observation)
+        assert reason is None if said is None else said in (reason or "")
 
 
 def test_a_noise_map_that_is_wrong_by_half_makes_no_lens_of_noise_and_no_noise_of_a_lens(lens: Observation) -> None:
