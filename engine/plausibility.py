@@ -137,7 +137,7 @@ def _look_at_psf(observation: Observation, found: Findings) -> None:
     if same_picture(observation.image, psf):
         found.contradict("psf: is the image itself")
     try:
-        found.notes.extend(f"{note.replace(' is subtracted', '').replace(' are replaced', '')}" for note in _flaws(psf))
+        found.notes.extend(flaw.partition(";")[0] for flaw in mended(psf)[1])
     except ObservationError as error:
         found.contradict(str(error))
     pixels = width(np.maximum(psf, 0.0))
@@ -147,10 +147,6 @@ def _look_at_psf(observation: Observation, found: Findings) -> None:
     sharpest = sharpest_peak(observation)
     if sharpest is not None and sharpest > _SHARP:
         found.note(f"psf: the image has a peak {sharpest:.1f} times as sharp: is it oversampled, or another filter's?")
-
-
-def _flaws(psf: FloatArray) -> tuple[str, ...]:
-    return mended(psf)[1]
 
 
 def sharpest_peak(observation: Observation) -> float | None:

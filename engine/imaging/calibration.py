@@ -211,6 +211,9 @@ def _stated_zero_point(headers: Headers) -> tuple[float, str] | None:
         # Of the ST system, whose constant it repeats; anything else it says is no part of this sum.
         away = 0.0 if base is None or abs(base[0] - _ST_ZERO_POINT) > 1.0 else base[0] - _ST_ZERO_POINT
         return float(magnitude) + away, f"{flux[1]} and PHOTPLAM"
+    response, area = headers.number("PHOTMJSR"), headers.number("PIXAR_SR")
+    if response is not None and area is not None and response[0] > 0 and area[0] > 0:
+        return float((response[0] * area[0] * units.MJy).to_value(units.ABmag)), f"{response[1]} and PIXAR_SR"
     stated = headers.number("PHOTZPT", *_ZERO_POINT)
     if stated is not None and abs(stated[0] - _ST_ZERO_POINT) < 1.0:
         stated = headers.number(*_ZERO_POINT)

@@ -51,7 +51,7 @@ def write_observation(path: str | Path, observation: Observation, *, overwrite: 
     for index, (key, value) in enumerate(observation.provenance.items()):
         header[f"PKEY{index}"] = json.dumps(key)
         header[f"PVAL{index}"] = json.dumps(value)
-    world = _world_coordinates(observation)
+    world = world_coordinates(observation)
     planes: list[Any] = [
         fits.ImageHDU(observation.image, world, name="IMAGE"),
         fits.ImageHDU(observation.noise, world, name="NOISE"),
@@ -73,7 +73,8 @@ def _fits_on_a_card(value: str | float | int) -> bool:
     return math.isfinite(value) and abs(value) < 2**63
 
 
-def _world_coordinates(observation: Observation) -> fits.Header:
+def world_coordinates(observation: Observation) -> fits.Header:
+    """World coordinates of an observation's pixels, as :func:`write_observation` has them."""
     ny, nx = observation.shape
     world = WCS(naxis=2)
     world.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]  # FITS counts pixels from 1

@@ -33,7 +33,7 @@ def width(psf: FloatArray) -> float:
 
 
 def mended(psf: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-    """The stamp without hot pixels and pedestal, and what was done to it.
+    """The stamp without hot pixels and pedestal; what was wrong with it and, behind a semicolon, what was done.
 
     A hot pixel exceeds all eight neighbours by a factor that no image of a star reaches; it becomes their median. A
     pedestal is an edge as bright as what is further in; wings are not, and a stamp too small to tell is left alone.
@@ -60,14 +60,14 @@ def mended(psf: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
         first = np.argwhere(hot)[0]
         psf = np.where(hot, smooth, psf)
         notes.append(
-            f"psf: {np.count_nonzero(hot)} hot pixels, as that in row {first[0]}, column {first[1]}, "
-            "are replaced by the median of their neighbours"
+            f"psf: {np.count_nonzero(hot)} hot pixels, as that in row {first[0]}, column {first[1]}; "
+            "replaced by the median of their neighbours"
         )
     level = _pedestal(psf)
     if level is not None:
         share = level * psf.size / float(psf.sum())
         psf = psf - level
-        notes.append(f"psf: a pedestal of {level:.3g} with {share:.0%} of its light is subtracted")
+        notes.append(f"psf: a pedestal of {level:.3g} with {share:.0%} of its light; subtracted")
     return psf, tuple(notes)
 
 

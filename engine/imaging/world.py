@@ -18,8 +18,8 @@ from engine.errors import ObservationError, SpecError
 from engine.imaging.fits_planes import LIBRARY_ERRORS, Headers, Slices, in_one_line, said
 
 _DISTORTION = re.compile(r"(A|B|AP|BP)_(ORDER|DMAX|\d+_\d+)|(CP|CQ)(DIS|ERR)\d|D2IM.*|(DP|DQ|D2IM)\d(\..*)?")
-_SQUARE, _HARDLY_SQUARE = 1e-3, 0.1
-"""Departures of a pixel from a square that are worth a note, and that cannot be left out of account."""
+_SQUARE, _HARDLY_SQUARE = 1e-3, 0.2
+"""Departures of a pixel from a square that are worth a note, and that cannot be left out of account: ACS has 0.09."""
 _LARGEST_PIXEL = 60.0
 """[arcsec]; beyond it there is no scale in the header: CDELT is 1 deg where it is missing."""
 

@@ -192,6 +192,10 @@ def test_an_i2d_of_jwst_is_read_by_its_planes_and_calibrated_by_photmjsr(files: 
     assert told(seen, "noise").origin == "drz.fits[ERR,1]"
     assert "PHOTMJSR of drz.fits[SCI,1]" in told(seen, "zero_point").origin
     assert told(seen, "exposure_s").origin == "XPOSURE of drz.fits[SCI,1]"
+    # So is the same light in DN/s.
+    files.science["BUNIT"], files.image = "DN/s", true
+    assert files.read(gain=1.0).zero_point == pytest.approx(zero_point, abs=1e-3)
+    files.science["BUNIT"], files.image = "MJy/sr", 2.0 * true
     # The gain turns DN into electrons: image and zero point move together.
     more = files.read(gain=1.8)
     assert more.zero_point == pytest.approx(zero_point + 2.5 * math.log10(1.8), abs=1e-3)
@@ -393,7 +397,7 @@ def test_a_hot_pixel_and_a_pedestal_are_taken_out_of_a_psf_and_told(files: Files
     clean = files.read().psf
     files.psf[5, 30] = 4.0
     seen = files.read()
-    assert noted(seen, "hot pixels, as that in row 5, column 30")
+    assert noted(seen, "1 hot pixels, as that in row 5, column 30")
     np.testing.assert_allclose(seen.psf, clean, atol=1e-5)
     files.psf = gaussian((41, 41), 20, 20, 1.3) + 0.01
     seen = files.read()
