@@ -21,14 +21,15 @@ from engine import (
 )
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.simulation.scene import power_law_lens
+from tests.engine.conftest import cut
 from tests.hard_cases.test_lenses import fold_and_inward
 
-QUICK = Analysis(source_pixels=(12, 12), max_steps=10, draws=12)
+QUICK = Analysis(source_pixels=(12, 12), subrays=1, psf_radius=8, max_steps=10, draws=4)
 """The chain is too short on purpose: what is tested does not depend on it."""
 
 
-def realization(system: str | LensSystem = "HE0435", magnitude: float = 20.5, r_eff: float = 0.39) -> Realization:
-    return Realization(system=system, l_eta=1.0, host=Host(n=2.0, r_eff=r_eff, magnitude=magnitude), analysis=QUICK)
+def realization(system: LensSystem | None = None, magnitude: float = 20.5, r_eff: float = 0.39) -> Realization:
+    return Realization(system=system or cut(), l_eta=1.0, host=Host(n=2.0, r_eff=r_eff, magnitude=magnitude), analysis=QUICK)
 
 
 def assert_host_found(result: RunResult, deviations: float = 3.5) -> None:
@@ -54,7 +55,7 @@ def test_a_host_fainter_than_the_noise_of_any_pixel_is_measured_within_its_error
     is finite; the image estimator is right to 3.5 of its own deviations, and says that it knows the magnitude to worse
     than 0.15.
     """
-    result = run(realization(magnitude=26.0))
+    result = run(realization(load_system("HE0435"), magnitude=26.0))
     assert everything_is_a_number(result)
     assert result.products is not None
     maps = result.products.arrays()
@@ -70,7 +71,7 @@ def test_a_host_that_is_not_there_is_an_error_that_says_so() -> None:
     the data hold no source that stands out of the noise.
     """
     with pytest.raises(PosteriorError, match="stands out"):
-        run(realization(magnitude=32.0))
+        run(realization(load_system("HE0435"), magnitude=32.0))
 
 
 @pytest.mark.long
@@ -96,7 +97,7 @@ def test_agn_seven_magnitudes_above_a_faint_host_leave_it_as_hs2209_does() -> No
     Could go wrong: what the PSF leaves of the AGN is brighter than the host, and is fitted as the host. Holds: both
     chi^2 and the image estimator are right: 0.9 to 1.1 per degree of freedom, and 3.5 of its own deviations.
     """
-    result = run(realization("HS2209", magnitude=23.0))
+    result = run(realization(cut("HS2209", 90), magnitude=23.0))
     assert everything_is_a_number(result)
     assert result.agn_contrast is not None
     assert result.agn_contrast < -4.0
@@ -123,8 +124,7 @@ def test_a_host_whose_ring_is_cut_by_the_edge_of_the_field_is_found_from_what_is
     Could go wrong: pixels beyond the edge are taken for dark, or light that the PSF carries over it is lost. Holds: the
     image estimator is right to 3.5 of its own deviations and the total magnitude to 0.1.
     """
-    system = load_system("HE0435")
-    result = run(realization(replace(system, exposures=replace(system.exposures, field_pixels=40))))
+    result = run(realization(cut(pixels=40)))
     assert result.products is not None
     assert result.products.arrays()["mask"][0].any()
     assert_host_found(result)
@@ -136,14 +136,13 @@ def test_a_field_that_cuts_an_agn_is_refused_and_not_fitted() -> None:
 
     Could go wrong: a lens is fitted to two of the four images. Holds: an EngineError.
     """
-    system = load_system("HE0435")
     with pytest.raises(EngineError):
-        run(realization(replace(system, exposures=replace(system.exposures, field_pixels=32))))
+        run(realization(cut(pixels=32)))
 
 
 def close_pair(separation: float) -> LensSystem:
     """HE0435 with its source so near a fold that two AGN images are as close as that [arcsec]."""
-    system = load_system("HE0435")
+    system = cut()
     mass = system.mass_models["recommended"]["1.0"]
     lens = power_law_lens(mass)
     fold, inward = fold_and_inward(lens, lens.phi + 0.6)
