@@ -27,9 +27,9 @@ from engine import (
 from engine.figures import measurement_figure
 from engine.imaging.observation import Observation
 from engine.measurement_files import write_measurement
-from engine.parametric.fit import ParametricFit, fit_parametric
+from engine.parametric.fit import fit_parametric
 from engine.simulation.simulate import Simulation
-from tests.engine.conftest import HELD_INDEX
+from tests.engine.conftest import cut
 
 SHARED_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
@@ -70,7 +70,7 @@ def test_fit_and_inversion_tell_their_chi2_in_the_same_noise(simulation: Simulat
 
 
 def test_an_arc_without_agn_is_found_from_its_ring() -> None:
-    system = replace(load_system("HE0435"), agn=())
+    system = replace(cut(), agn=())
     realization = Realization(system=system, l_eta=1.0, host=Host(n=1.5, r_eff=0.3, magnitude=21.0))
     observation = simulate_realization(realization).observation
     lens = load_system("HE0435").mass_models["recommended"]["1.0"]
@@ -98,12 +98,6 @@ def test_the_result_is_plain_json_with_the_promised_fields(found: ImageMeasureme
         assert key in document
 
 
-def test_the_same_image_gives_the_same_numbers(simulation: Simulation, fit: ParametricFit) -> None:
-    again = fit_parametric(simulation.observation, agn_images=4, fixed_index=HELD_INDEX)
-    assert (again.host, again.lens, again.agn) == (fit.host, fit.lens, fit.agn)
-    assert np.array_equal(again.lens_covariance, fit.lens_covariance)
-
-
 def test_an_image_of_nothing_has_no_lens(simulation: Simulation) -> None:
     rng = np.random.default_rng(0)
     seen = simulation.observation
@@ -116,7 +110,7 @@ def test_an_image_of_nothing_has_no_lens(simulation: Simulation) -> None:
 
 def test_a_bad_fit_is_no_start(simulation: Simulation) -> None:
     whole = simulation.observation
-    middle = (slice(20, 79), slice(20, 79))
+    middle = (slice(3, 62), slice(3, 62))
     seen = Observation(whole.image[middle], whole.noise[middle], whole.psf, whole.pixel_scale, whole.zero_point)
     y, x = np.indices(seen.shape) - 29.0
     # Twelve bright blobs that no lens makes.
