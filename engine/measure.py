@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from engine.analyse import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit_warning
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
@@ -22,6 +21,7 @@ from engine.imaging.observation import Observation
 from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
+from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit_warning
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from engine.analyse import Reconstruction
 from engine.conventions import position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.estimators.summaries import galfit_radius
 from engine.inspection import InversionView
 from engine.light.cell_means import profile_on_grid
 from engine.light.sersic import SersicProfile, flux_in_circle, mean_surface_brightness
+from engine.reconstruction import Reconstruction
 from engine.result import Aperture, Estimate, LensParameter, Quantity, RunResult, SourcePlane, StageTime
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
