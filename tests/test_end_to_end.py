@@ -43,7 +43,7 @@ def test_a_grid_of_the_paper_survives_a_kill_and_all_that_is_found_is_the_engine
         summary = client.grid_summary(grid.id)
         results = {found.inputs["n"]: (found.id, client.run(found.id).result) for found in client.runs(grid.id)}
         assert all(result is not None and result.figure is not None for _, result in results.values())
-        first, result = results[2.0]
+        first, _ = results[2.0]
         arrays, record = client.products(first), client.record(first)
         assert b"<svg" in client.figure(grid.id, "bias")[:2000]
         assert client.figure(None, "bias", system="HE0435") == client.figure(None, "bias", system=["HE0435"])

@@ -181,7 +181,7 @@ def test_a_replay_says_what_differs_the_largest_first(
     ran: Ran, files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # What is computed is what was found, as seen above.
-    monkeypatch.setattr("service.cli.replay._compute", lambda spec: (ran.payload, ran.payload.versions))
+    monkeypatch.setattr("service.cli.replay._compute", lambda _: (ran.payload, ran.payload.versions))
     found = json.loads(files["run.json"].read_text())
     found["payload_digest"], found["engine_digest"] = "0" * 64, "1" * 64
     found["versions"] |= {"numpy": "1.0", "platform": "Plan9 vax"}
