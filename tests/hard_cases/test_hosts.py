@@ -30,14 +30,14 @@ FAINT = Analysis(source_pixels=(12, 12), max_steps=10, draws=4)
 """For hosts below the noise, where the wings of the PSF count: with eight pixels of it they are taken for a source."""
 
 
-def realization(system: LensSystem | None = None, magnitude: float = 20.5, r_eff: float = 0.39) -> Realization:
+def realization(system: LensSystem | str | None = None, magnitude: float = 20.5, r_eff: float = 0.39) -> Realization:
     host = Host(n=2.0, r_eff=r_eff, magnitude=magnitude)
     return Realization(system=system or cut(), l_eta=1.0, host=host, analysis=QUICK)
 
 
 def faint(magnitude: float) -> Realization:
     """In the whole field: the sky round the ring is all that tells noise from a host that is hardly there."""
-    return replace(realization(load_system("HE0435"), magnitude), analysis=FAINT)
+    return replace(realization("HE0435", magnitude), analysis=FAINT)
 
 
 def assert_host_found(result: RunResult, deviations: float = 3.5) -> None:
