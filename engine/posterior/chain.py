@@ -24,10 +24,10 @@ from engine.result import ChainStatus, ChainSummary
 
 _SURROGATE_SHARE = 0.9
 """The remaining differential evolution is for what no surrogate has learnt."""
-_BURN_IN_STEPS = 5
+_BURN_IN_STEPS = 3
 _RESTARTS, _RESTART_STEPS, _USUAL_TAU = 2, 60, 2.0
 """How often, and after how many steps, a chain may be restarted with a surrogate that has learnt from it; tau then."""
-_CHUNK = 15
+_CHUNK = 5
 _WINDOW = 5
 AUTOCORRELATION_TIMES = 50.0
 """Least length of a chain that is called converged, in autocorrelation times (emcee's own rule)."""
