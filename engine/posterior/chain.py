@@ -138,7 +138,7 @@ def _on_surrogate(
     moves = [(emcee.moves.MHMove(surrogate), _SURROGATE_SHARE)]
     if walkers >= 2 * laplace.mean.size:
         moves.append((emcee.moves.DEMove(), 1.0 - _SURROGATE_SHARE))
-    sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, known, moves=moves)
+    sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, known.many, moves=moves, vectorize=True)
     state = emcee.State(surrogate.draw(walkers, random), random_state=random.get_state())
     state = sampler.run_mcmc(state, _BURN_IN_STEPS, skip_initial_state_check=True)
     sampler.reset()

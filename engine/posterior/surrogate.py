@@ -1,8 +1,8 @@
 """A surrogate of the target, learnt from evaluations of it, and the move of a chain that walks on it.
 
-The surrogate is the Gaussian approximation, with tails that fall more slowly, times the exponential of a Gaussian process
-through what ln of the target differs from it by: it follows a posterior that bends, and far from all that is known it is
-the approximation. A walk on it costs next to nothing. Where a walk ends is a proposal that the target then accepts with
+The surrogate is the Gaussian approximation, with tails that fall more slowly, times the exponential of a Gaussian
+process through what ln of the target differs from it by: it follows a posterior that bends, and far from all that is
+known it is the approximation. A walk on it costs next to nothing. Where it ends is a proposal, accepted with
 probability min(1, pi(y) s(x) / (pi(x) s(y))) (delayed acceptance: Christen & Fox 2005): each step of the walk is
 reversible with regard to the surrogate s, which may be a warmer one, and so is the walk. That leaves the target pi
 invariant however wrong the surrogate is; a wrong one costs acceptance.
@@ -151,15 +151,14 @@ def learn_surrogate(known: Recorded, prior: Prior, laplace: Laplace, random: np.
         The Gaussian approximation lies where the target is nothing.
     """
     if len(known.values) < laplace.mean.size:
-        for place in StudentProposal(laplace.mean, _TEMPERATURE * laplace.covariance).draw(_FIRST, random):
-            known(place)
+        known.many(StudentProposal(laplace.mean, _TEMPERATURE * laplace.covariance).draw(_FIRST, random))
     if not known.values:
         raise PosteriorError("chain: the target is nothing anywhere that the Gaussian approximation proposes")
     surrogate, population = fit_surrogate(known, prior, laplace.mean, laplace.covariance, random)
     for batch in _BATCHES:
         places, expected, _ = surrogate.walk(population[:batch], _WALK, random, _TEMPERATURE)
         top = max(known.values)
-        found = np.array([known(place) for place in places])
+        found = known.many(places)
         near = found > top - 0.5 * places.shape[1] - 4.0
         error = (found - expected)[near]
         surrogate, population = fit_surrogate(
