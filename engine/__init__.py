@@ -1,40 +1,17 @@
 """The engine of hostlens: one realization in, one result out; pure functions on arrays and frozen dataclasses.
 
-This module is the engine's public face: everything that ``service`` or a user may import.
+This module is the engine's public face: everything that ``service`` or a user may import. What may be asked for
+is there at once; what computes is loaded when its name is first used, so that a mistake is told within a second.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING
 
 import engine.home  # noqa: F401 - before Astropy is imported
 
 # isort: split
 
-from engine.acceptance import check_realization
-from engine.analyse import Reconstruction, analyse
-from engine.biases import (
-    BIN_WIDTH,
-    GROUPINGS,
-    HOST_QUANTITIES,
-    TRENDS,
-    BiasPoint,
-    Configuration,
-    CoverageCurve,
-    Grouping,
-    HostQuantity,
-    PullSummary,
-    Spread,
-    Trend,
-    TrendBin,
-    TrendSeries,
-    bias_points,
-    configuration_of,
-    coverage_curve,
-    group_points,
-    mean_bias,
-    pull_summary,
-    serial_numbers,
-    trend_series,
-)
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
-from engine.compare import compare
 from engine.digest import engine_digest, engine_versions
 from engine.errors import (
     EngineError,
@@ -60,12 +37,6 @@ from engine.grid import (
     expand,
     preset_names,
 )
-from engine.imaging.external import NoiseFromImage, observation_from_arrays
-from engine.imaging.external_files import read_external_observation
-from engine.imaging.fits import read_observation, write_observation
-from engine.imaging.observation import Observation
-from engine.inspection import InversionView, inspect_inversion
-from engine.measure import ImageMeasurement, measure_image
 from engine.result import (
     Aperture,
     ChainSummary,
@@ -78,10 +49,6 @@ from engine.result import (
     SourcePlane,
     StageTime,
 )
-from engine.run import inspect_simulation, run
-from engine.simulation.scene import check_analysis, check_system
-from engine.simulation.seeds import generator
-from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import PROFILES, Analysis
 from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.json_text import read_json
@@ -98,6 +65,79 @@ from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 from engine.stages import STAGES
 from engine.user_files import read_camera, read_mapping, read_system
+
+if TYPE_CHECKING:
+    from engine.acceptance import check_realization
+    from engine.biases import (
+        BIN_WIDTH,
+        GROUPINGS,
+        HOST_QUANTITIES,
+        TRENDS,
+        BiasPoint,
+        Configuration,
+        CoverageCurve,
+        Grouping,
+        HostQuantity,
+        PullSummary,
+        Spread,
+        Trend,
+        TrendBin,
+        TrendSeries,
+        bias_points,
+        configuration_of,
+        coverage_curve,
+        group_points,
+        mean_bias,
+        pull_summary,
+        serial_numbers,
+        trend_series,
+    )
+    from engine.comparison import compare
+    from engine.experiment import inspect_simulation, run
+    from engine.imaging.external import NoiseFromImage, observation_from_arrays
+    from engine.imaging.external_files import read_external_observation
+    from engine.imaging.fits import read_observation, write_observation
+    from engine.imaging.observation import Observation
+    from engine.inspection import InversionView, inspect_inversion
+    from engine.measure import ImageMeasurement, measure_image
+    from engine.reconstruction import Reconstruction, analyse
+    from engine.simulation.scene import check_analysis, check_system
+    from engine.simulation.seeds import generator
+    from engine.simulation.simulate import Simulation, simulate_realization
+else:
+    _LATE = {
+        "engine.acceptance": "check_realization",
+        "engine.biases": (
+            "BIN_WIDTH GROUPINGS HOST_QUANTITIES TRENDS BiasPoint Configuration CoverageCurve Grouping "
+            "HostQuantity PullSummary Spread Trend TrendBin TrendSeries bias_points configuration_of "
+            "coverage_curve group_points mean_bias pull_summary serial_numbers trend_series"
+        ),
+        "engine.comparison": "compare",
+        "engine.experiment": "inspect_simulation run",
+        "engine.imaging.external": "NoiseFromImage observation_from_arrays",
+        "engine.imaging.external_files": "read_external_observation",
+        "engine.imaging.fits": "read_observation write_observation",
+        "engine.imaging.observation": "Observation",
+        "engine.inspection": "InversionView inspect_inversion",
+        "engine.measure": "ImageMeasurement measure_image",
+        "engine.reconstruction": "Reconstruction analyse",
+        "engine.simulation.scene": "check_analysis check_system",
+        "engine.simulation.seeds": "generator",
+        "engine.simulation.simulate": "Simulation simulate_realization",
+    }
+    _HOME = {name: module for module, names in _LATE.items() for name in names.split()}
+
+    def __getattr__(name):
+        """Load the module that a name is of; mypy reads the imports above instead."""
+        if name not in _HOME:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        found = globals()[name] = getattr(import_module(_HOME[name]), name)
+        return found
+
+    def __dir__():
+        """All names, loaded or not."""
+        return sorted({*globals(), *_HOME})
+
 
 __all__ = [
     "BIN_WIDTH",

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
 
-from engine.analyse import degrees_of_freedom, inverted_image, inverted_source
 from engine.imaging.observation import Observation
 from engine.likelihood.evidence import Inversion
 from engine.likelihood.problem import prepare_problem
@@ -15,6 +14,7 @@ from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum
 from engine.posterior.start import find_start, prepare_target
 from engine.posterior.traces import EvidenceTrace, trace_evidence
+from engine.reconstruction import degrees_of_freedom, inverted_image, inverted_source
 from engine.result import ImagePlane, SourcePlane
 from engine.spec.analysis import Analysis
 

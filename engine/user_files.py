@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from engine.errors import SpecError
-from engine.simulation.scene import check_system
 from engine.spec.instrument import Camera
 from engine.spec.json_text import read_json
 from engine.spec.realization import camera_from_mapping, system_from_mapping
@@ -34,6 +33,9 @@ def read_system(path: str | Path) -> LensSystem:
         The file cannot be read.
     """
     system = system_from_mapping(read_mapping(path))
+    # Solves the lens equation, which takes a second to load: only a system whose fields are right is worth that.
+    from engine.simulation.scene import check_system  # noqa: PLC0415
+
     check_system(system)
     return system
 

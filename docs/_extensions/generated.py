@@ -23,7 +23,14 @@ ROOT = DOCS.parent
 OUTSIDE = "_outside"
 """Folder of the copies, beside the pages; made anew at each build."""
 COPIED = ("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "benchmarks/LEDGER.md", "deploy/**/*.md")
-FIRST = ("engine.run", "engine.measure", "engine.analyse", "engine.compare", "engine.result", "engine.grid")
+FIRST = (
+    "engine.experiment",
+    "engine.measure",
+    "engine.reconstruction",
+    "engine.comparison",
+    "engine.result",
+    "engine.grid",
+)
 """What most look for."""
 _MARK = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
 _LINK = re.compile(r"(?<=\]\()([^)#\s:]+)(#[^)\s]*)?(?=\))")

@@ -8,9 +8,11 @@ from fastapi import Depends, Path, Query, Request
 
 from service.api.hub import Hub
 from service.api.metrics import ApiMetrics
+from service.api.threads import QUICK, SharedReads
 from service.domain.identifiers import GRID_PATTERN, RUN_PATTERN
 from service.figures.kept import KeptFigures
 from service.runtime import logs
+from service.runtime.kept import KeptBytes
 from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
 from service.store.costs import CostStore
@@ -21,7 +23,7 @@ from service.store.measurements import MeasurementStore
 from service.store.outbox import EventStore
 from service.store.tokens import TokenStore
 
-_KEPT_BYTES = 32 * 2**20
+_KEPT_FIGURES, _KEPT_RUNS = 32 * 2**20, 16 * 2**20
 _IDS = frozenset({"grid_id", "run_id"})
 
 
@@ -36,13 +38,15 @@ class Context:
         self.events = EventStore(self.database)
         self.measurements = MeasurementStore(self.database)
         self.tokens = TokenStore(self.database)
+        self.reads = SharedReads(QUICK)
         self.hub = Hub(self.events, settings.max_streams)
         # A connection of their own each time, or probes would queue behind whoever waits for the database already.
         self.probed = Database(settings.database, pooled=False)
         self.leadership = Leadership(self.probed, settings.leader_ttl_s)
         self.metrics = ApiMetrics(self.database, self.leadership)
         self.artefacts = ArtefactStore(settings.artefacts, patience_s=10.0)
-        self.figures = KeptFigures(_KEPT_BYTES)
+        self.figures = KeptFigures(_KEPT_FIGURES)
+        self.runs = KeptBytes(_KEPT_RUNS)
 
 
 async def _context(request: Request) -> Context:

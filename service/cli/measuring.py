@@ -59,16 +59,16 @@ def measure(
         if path is not None:
             require_file(path, kinds)
     require_readable(path for path in (image, noise, psf, mask) if path is not None)
+    where = _positions(positions)
     with refusals():
         from rich.console import Console  # noqa: PLC0415 - help needs none
-
-        from engine import measure_image  # noqa: PLC0415 - the engine takes seconds to load
 
         observation = _observation(
             image, noise, psf, pixel_scale, zeropoint,
             mask=mask, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation, sky_rms_e_s=sky_rms,
         )  # fmt: skip
-        where = _positions(positions)
+        from engine import measure_image  # noqa: PLC0415 - seconds, which only an image is worth
+
         console = Console(stderr=True)
         with console.status("reading") as status:
             found = measure_image(
@@ -89,30 +89,38 @@ def _observation(
     image: Path, noise: Path | None, psf: Path | None, pixel_scale: float | None, zeropoint: float | None, **how: Any
 ) -> Observation:
     """Our own FITS file as it is, or anybody's from its parts."""
-    from astropy.io import fits  # noqa: PLC0415 - as the engine
-
-    from engine import ObservationError, read_external_observation, read_observation  # noqa: PLC0415
-
     if psf is None:
-        try:
-            own = "HOSTLENS" in fits.getheader(image)
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise ObservationError(f"{image}: not a FITS file that can be read ({error})") from error
-        if own:
-            if noise is not None or pixel_scale is not None or zeropoint is not None:
-                raise typer.BadParameter(f"{image} has noise map, pixel scale and zero point in it: leave them out")
-            return read_observation(image)
-        raise typer.BadParameter(f"--psf: {image} is not of `hostlens simulate`, so a PSF must be given")
+        return _own_observation(image, (noise, pixel_scale, zeropoint))
     if zeropoint is None or not math.isfinite(zeropoint):
         raise typer.BadParameter("--zeropoint: the AB magnitude of 1 e-/s must be given")
     if how["unit"] not in ("e-/s", "e-"):
         raise typer.BadParameter(f"--unit: got {how['unit']!r}, allowed is e-/s or e-")
+    from engine import read_external_observation  # noqa: PLC0415 - seconds, which only right options are worth
+
     return read_external_observation(
         image, psf, zero_point=zeropoint, noise=noise, pixel_scale=pixel_scale, recentre_psf="pixel",
         normalise_psf=True, **how,
     )  # fmt: skip
+
+
+def _own_observation(image: Path, told: tuple[Path | float | None, ...]) -> Observation:
+    from astropy.io import fits  # noqa: PLC0415 - as the engine
+
+    from engine import ObservationError  # noqa: PLC0415
+
+    try:
+        own = "HOSTLENS" in fits.getheader(image)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ObservationError(f"{image}: not a FITS file that can be read ({error})") from error
+    if not own:
+        raise typer.BadParameter(f"--psf: {image} is not of `hostlens simulate`, so a PSF must be given")
+    if any(value is not None for value in told):
+        raise typer.BadParameter(f"{image} has noise map, pixel scale and zero point in it: leave them out")
+    from engine import read_observation  # noqa: PLC0415 - as above
+
+    return read_observation(image)
 
 
 def _positions(given: list[str] | None) -> list[tuple[float, float]] | None:

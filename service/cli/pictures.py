@@ -86,12 +86,14 @@ def montage(
     """Picture the 48 realizations of a system. They are numbered as in the paper's Table 3."""
     _require_files(camera)
     with refusals():
-        from engine import Grid, expand, simulate_realization  # noqa: PLC0415
-        from engine.figures import montage_figure  # noqa: PLC0415
+        from engine import Grid, expand  # noqa: PLC0415
 
         document = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
         runs = expand(_validated(Grid, preset=f"h0licow-vi/{system}", camera=_camera(camera), **document))
         require_folder(out)
+        from engine import simulate_realization  # noqa: PLC0415 - after all that may be refused
+        from engine.figures import montage_figure  # noqa: PLC0415
+
         observations = []
         with _progress(f"simulating {system}", len(runs)) as advance:
             for run in runs:
@@ -108,12 +110,14 @@ def gallery(
 ) -> None:
     """Picture the eight systems side by side. Each also with its lensed host alone."""
     with refusals():
-        from engine import Grid, expand, simulate_realization  # noqa: PLC0415
-        from engine.figures import gallery_figure  # noqa: PLC0415
+        from engine import Grid, expand  # noqa: PLC0415
 
         grid = _validated(Grid, preset="h0licow-vi", seed=seed, noise_level=noise_level)
         runs = [run for run in expand(grid) if run.paper_run == paper_run]
         require_folder(out)
+        from engine import simulate_realization  # noqa: PLC0415 - as above
+        from engine.figures import gallery_figure  # noqa: PLC0415
+
         simulations: list[Simulation] = []
         with _progress("simulating the eight systems", len(runs)) as advance:
             for run in runs:
@@ -145,13 +149,13 @@ def inversion(
     if out is not None:
         require_kind(out, PICTURES)
     with refusals():
-        from engine import inspect_simulation, simulate_realization  # noqa: PLC0415
-        from engine.figures import inversion_figure  # noqa: PLC0415
-
         realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
         path = out or Path(f"{as_file_name(realization.system_name)}_inversion.png")
         require_folder(path.parent)
         require_file(path, PICTURES)
+        from engine import inspect_simulation, simulate_realization  # noqa: PLC0415 - as above
+        from engine.figures import inversion_figure  # noqa: PLC0415
+
         with _progress(f"inverting {realization.system_name}", 3) as advance:
             simulation = simulate_realization(realization)
             advance()
@@ -166,7 +170,7 @@ COMMANDS = (simulate, montage, gallery, inversion)
 
 
 def _realization(system: str, host: HostOptions, camera: str | None, common: dict[str, Any]) -> Realization:
-    from engine import realization_from_dict  # noqa: PLC0415
+    from engine import load_camera, load_system, realization_from_dict  # noqa: PLC0415
 
     chosen: str | LensSystem = system
     values = {"r_eff": host.r_eff, "magnitude": host.magnitude}
@@ -180,9 +184,15 @@ def _realization(system: str, host: HostOptions, camera: str | None, common: dic
             raise typer.BadParameter(f"a system of your own has no default host: give {options}")
     else:
         values = _paper_values(system) | {name: value for name, value in values.items() if value is not None}
-    return realization_from_dict(
+    found = realization_from_dict(
         {"system": chosen, "l_eta": host.l_eta, "host": {"n": host.n, **values}, "camera": _camera(camera), **common}
     )
+    # Names that the catalogue does not have would be told by the simulation too, when all of it is loaded.
+    lens = load_system(found.system) if isinstance(found.system, str) else found.system
+    lens.mass_model(found.mass_model, found.l_eta)
+    if isinstance(found.camera, str):
+        load_camera(found.camera)
+    return found
 
 
 def _paper_values(system: str) -> dict[str, float | None]:
@@ -220,9 +230,6 @@ def _validated(kind: Any, **fields: Any) -> Any:
 
 
 def _write_one(realization: Realization, out: Path) -> None:
-    from engine import simulate_realization, write_observation  # noqa: PLC0415
-    from engine.figures import simulation_figure  # noqa: PLC0415
-
     host = realization.host
     # The digest in the name: another seed or camera is another file, and the same command writes the same one again.
     stem = (
@@ -230,6 +237,9 @@ def _write_one(realization: Realization, out: Path) -> None:
         f"_{realization.digest[:8]}"
     )
     require_folder(out)
+    from engine import simulate_realization, write_observation  # noqa: PLC0415 - as above
+    from engine.figures import simulation_figure  # noqa: PLC0415
+
     with _progress(f"simulating {realization.system_name}", 3) as advance:
         simulation = simulate_realization(realization)
         advance()

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engine.compare import estimate_beside
+from engine.comparison import estimate_beside
 from engine.conventions import rate_to_magnitude
 from engine.estimators.aperture import aperture_flux
 from engine.estimators.draws import SourceDraw, source_draw

@@ -1,12 +1,15 @@
 """The walls of the engine: which package may know which."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import engine
+from tests.sources import parsed
 
 ROOT = Path(engine.__file__).parent
 MODULES = sorted(ROOT.rglob("*.py"))
@@ -22,7 +25,7 @@ NAMES = {module_name(path) for path in MODULES}
 
 def imported(path: Path) -> Iterator[str]:
     """Modules that a module imports, wherever in it the import stands."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -79,3 +82,18 @@ def test_the_engine_knows_nothing_of_service_tests_or_its_own_face(path: Path) -
     names = set(imported(path))
     assert not {name for name in names if name.split(".")[0] in {"service", "tests", "benchmarks", "migrations"}}
     assert "engine" not in names
+
+
+def test_the_face_has_every_name_it_says_and_shows_what_is_not_loaded_yet() -> None:
+    program = "import engine, sys; print(set(engine.__all__) <= set(dir(engine)), 'numba' in sys.modules)"
+    told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert told.split() == ["True", "False"]
+    for name in engine.__all__:
+        assert getattr(engine, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = engine.nothing  # type: ignore[attr-defined]
+
+
+def test_no_module_of_the_engine_takes_a_name_of_its_face() -> None:
+    # The import of a module binds its name in the package, and what the face means by it would be out of reach.
+    assert not {name.split(".")[1] for name in NAMES if "." in name} & set(engine.__all__)

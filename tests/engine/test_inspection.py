@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from engine import InversionView, inspect_inversion
-from engine.compare import view_beside
+from engine.comparison import view_beside
 from engine.figures import inversion_figure
 from engine.simulation.simulate import Simulation
 from tests.engine.conftest import QUICK

@@ -22,12 +22,12 @@ from engine import (
     simulate_realization,
 )
 from engine.catalogue import system_names
+from engine.experiment import analysis_of
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.evidence import ln_evidence
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.target import Target, wide_prior
-from engine.run import analysis_of
 from engine.source.regularisation import SourceModel
 from engine.spec.priors import ParameterPrior
 from engine.spec.realization import realization_from_dict

@@ -278,7 +278,7 @@ def test_estimators_that_make_no_sense_are_refused(names: list[str]) -> None:
 
 def test_another_picture_of_the_same_numbers_is_no_other_engine() -> None:
     names = [name for name, _ in digest._walk(files("engine"))]
-    assert {"lensing/power_law.py", "catalogue/systems.yaml", "run.py"} <= set(names)
+    assert {"lensing/power_law.py", "catalogue/systems.yaml", "experiment.py"} <= set(names)
     assert not [name for name in names if name.startswith("figures/")]
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from engine.analyse import Reconstruction
 from engine.conventions import position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.estimators.summaries import galfit_radius
 from engine.inspection import InversionView
 from engine.light.cell_means import profile_on_grid
 from engine.light.sersic import SersicProfile, flux_in_circle, mean_surface_brightness
+from engine.reconstruction import Reconstruction
 from engine.result import Aperture, Estimate, LensParameter, Quantity, RunResult, SourcePlane, StageTime
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
@@ -52,8 +52,8 @@ def compare(
         lens=tuple(lens_beside(parameter, scene) for parameter in found.lens),
         chain=None if inversion is None else inversion.chain.summary,
         ln_evidence=None if inversion is None else inversion.best.ln_evidence,
-        chi2=found.fit.chi2 if inversion is None else inversion.chi2,
-        degrees_of_freedom=found.fit.degrees_of_freedom if inversion is None else inversion.degrees_of_freedom,
+        chi2=found.chi2,
+        degrees_of_freedom=found.degrees_of_freedom,
         condition_number=None if inversion is None else inversion.best.condition_number,
         arc_magnitude=truth.arc_magnitude,
         agn_contrast=rate_to_magnitude(agn_flux, zero_point) - truth.arc_magnitude if agn_flux > 0 else None,

@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from engine.acceptance import check_realization
-from engine.analyse import analyse
-from engine.compare import compare, view_beside
+from engine.comparison import compare, view_beside
 from engine.inspection import InversionView, inspect_inversion
+from engine.reconstruction import analyse
 from engine.result import RunResult
 from engine.simulation.scene import resolve_system
 from engine.simulation.seeds import generator
