@@ -13,7 +13,7 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
-from engine.likelihood.w_tilde import curvature_matrices, curvature_matrix, workspace
+from engine.likelihood.w_tilde import curvature_matrices, curvature_matrix, together, workspace
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, map_rays
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant
@@ -23,10 +23,6 @@ MAX_CONDITION = 1e14
 
 MAX_LN_LAMBDA = 700.0
 """Beyond it lambda or its inverse is no number of float64."""
-
-
-TOGETHER = 4
-"""Evaluations that share the blocks of W: what they need of the second-level cache grows with their number."""
 
 
 @dataclass(frozen=True)
@@ -149,16 +145,17 @@ def ln_evidences(
 ) -> list[float | InversionError]:
     """Ln Z of the data given each lens and its ln lambda; where it cannot be had the error that says why.
 
-    ``TOGETHER`` at a time share what it costs to fetch W from memory.
+    As many as fit the cache share what it costs to fetch W from memory (:func:`~.w_tilde.together`).
     """
     n = model.shape[0] * model.shape[1]
     found: list[float | InversionError] = []
-    for begin in range(0, len(lenses), TOGETHER):
-        mapped = [_mapped(likelihood, lens, model) for lens in lenses[begin : begin + TOGETHER]]
+    size = together(n)
+    for begin in range(0, len(lenses), size):
+        mapped = [_mapped(likelihood, lens, model) for lens in lenses[begin : begin + size]]
         lensings = [each for each in mapped if isinstance(each, LensingMatrix)]
         memory = [workspace.array(f"A{k}", (n, n)) for k in range(len(lensings))]
         curved = iter(curvature_matrices(likelihood.w_tilde, likelihood.border, lensings, memory))
-        for each, ln_lambda in zip(mapped, ln_lambdas[begin : begin + TOGETHER], strict=True):
+        for each, ln_lambda in zip(mapped, ln_lambdas[begin : begin + size], strict=True):
             if isinstance(each, InversionError):
                 found.append(each)
                 continue

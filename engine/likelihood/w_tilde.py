@@ -28,6 +28,9 @@ TILE = 48
 CHUNK = 64
 """Source pixels that the second product works on at once."""
 
+_CACHE = 640 * 1024
+"""Bytes of the second-level cache that L^T V of one patch may take, of all lenses that share a pass over W."""
+
 _STRIP = 8
 """Rows of the image that a patch spans."""
 
@@ -329,12 +332,17 @@ class _Workspace(threading.local):
 workspace = _Workspace()
 
 
+def together(n: int) -> int:
+    """How many lenses share a pass over W for n source pixels: 4 for 20 x 20, one for 30 x 30."""
+    return max(1, _CACHE // (8 * TILE * n))
+
+
 def curvature_matrices(
     w_tilde: WTilde, border: FloatArray, lensings: Sequence[LensingMatrix], out: Sequence[FloatArray] | None = None
 ) -> list[FloatArray]:
     """F = L^T (W - T T^T) L (n, n) of each L, in Fortran order, valid in the lower triangle.
 
-    Together they cost less than one by one, since W is larger than the caches, and they are the same bit by bit.
+    Up to :func:`together` of them cost less than one by one, since W is larger than the caches; bits are the same.
 
     Parameters
     ----------

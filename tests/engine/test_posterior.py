@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
+from engine.likelihood.w_tilde import together
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
 from engine.posterior.proposal import StudentProposal
@@ -199,15 +200,16 @@ def test_outside_the_prior_nothing_is_evaluated() -> None:
 
 def test_places_asked_for_together_have_the_value_that_each_has_alone_bit_by_bit() -> None:
     """More of them than share a pass over W, one outside the prior and one whose inversion is refused among them."""
-    target = Target(Case().likelihood(), wide_prior(LENS, shear=True), SourceModel((30, 30)))
+    target = Target(Case().likelihood(), wide_prior(LENS, shear=True), SourceModel((20, 20)))
+    assert together(400) == 4
     places = np.array([target.vector(LENS.with_values(slope=2.0 + 0.01 * k), -1.0 + 0.1 * k) for k in range(7)])
     places[2, 1] = 1.2
     target.prior.low[-1] = -300.0
     places[4, -1] = -250.0
-    together = target.many(places)
+    found = target.many(places)
     assert (target.evaluations, target.refused) == (6, 1)
-    assert together.tolist() == [target(values) for values in places]
-    assert np.flatnonzero(~np.isfinite(together)).tolist() == [2, 4]
+    assert found.tolist() == [target(values) for values in places]
+    assert np.flatnonzero(~np.isfinite(found)).tolist() == [2, 4]
 
 
 def test_a_surrogate_of_a_gaussian_has_nothing_to_unlearn() -> None:
