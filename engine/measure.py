@@ -21,14 +21,12 @@ from engine.imaging.observation import Observation
 from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
-from engine.reconstruction import SampledInversion, analyse, lens_of_fit
+from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit_warning
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
 
 MeasurementStatus = Literal["ok", "poor_fit"]
-POOR_FIT = 1.5
-"""chi^2 per degree of freedom from which on the status says that the model does not describe the image."""
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
 _NAMES = {"image": "parametric"}
@@ -249,7 +247,7 @@ def measure_image(
     status: MeasurementStatus = "ok"
     if chi2 > POOR_FIT:
         status = "poor_fit"
-        warnings.append(f"model: chi2 per degree of freedom is {chi2:.2f}; the errors do not cover what it misses")
+        warnings.append(poor_fit_warning(chi2))
     return ImageMeasurement(
         host=host,
         estimates=(host, *(estimate for estimate in drawn if estimate.index_prior == "wide")),

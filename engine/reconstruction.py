@@ -8,7 +8,7 @@ The part behind the parametric fit is left out where no estimator needs it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -40,6 +40,9 @@ from engine.result import (
 )
 from engine.spec.analysis import Analysis
 from engine.stages import Progress, Stopwatch
+
+POOR_FIT = 1.5
+"""chi^2 per degree of freedom from which on it is said that the model does not describe the image."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +84,16 @@ class Reconstruction:
     def lens(self) -> tuple[LensParameter, ...]:
         """The lens of the chain, or of the parametric fit where there is none."""
         return lens_of_fit(self.fit) if self.inversion is None else self.inversion.lens
+
+    @property
+    def chi2(self) -> float:
+        """Of the inversion, or of the parametric fit where there is none."""
+        return self.fit.chi2 if self.inversion is None else self.inversion.chi2
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Those of ``chi2``."""
+        return self.fit.degrees_of_freedom if self.inversion is None else self.inversion.degrees_of_freedom
 
     @property
     def products(self) -> Products:
@@ -147,7 +160,14 @@ def analyse(
             for prior in _priors(fixed_index)
             if prior in fit.hosts
         )
-    return Reconstruction(observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings)
+    found = Reconstruction(observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings)
+    misfit = found.chi2 / found.degrees_of_freedom
+    return replace(found, warnings=(*warnings, poor_fit_warning(misfit))) if misfit > POOR_FIT else found
+
+
+def poor_fit_warning(misfit: float) -> str:
+    """What is said where ``misfit``, the chi2 per degree of freedom, exceeds :data:`POOR_FIT`."""
+    return f"model: chi2 per degree of freedom is {misfit:.2f}; the errors do not cover what it misses"
 
 
 def _priors(fixed_index: float | None) -> list[IndexPrior]:

@@ -15,11 +15,12 @@ from xdist.remote import Producer  # noqa: E402
 from xdist.scheduler import LoadScopeScheduling  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
+LONG = ("tests/service/test_drills.py",)
+"""Files that take long and whose tests share what is costly to make: begun before all others, each by one process."""
 APART = (
     "tests/test_end_to_end.py",
     "tests/service/test_stalls.py",
     "tests/service/test_clusters.py",
-    "tests/service/test_drills.py",
     "tests/service/test_foreign_clocks.py",
     "tests/service/test_processes.py",
     "tests/deploy/test_topology.py",
@@ -53,10 +54,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     FileNotFoundError
         A file of that list is no more.
     """
-    for file in APART:
+    first = LONG + APART
+    for file in first:
         (ROOT / file).stat()
-    place = {file: number for number, file in enumerate(APART)}
-    items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(place)))
+    place = {file: number for number, file in enumerate(first)}
+    items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(first)))
 
 
 @pytest.hookimpl(wrapper=True)

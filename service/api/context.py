@@ -8,6 +8,7 @@ from fastapi import Depends, Path, Query, Request
 
 from service.api.hub import Hub
 from service.api.metrics import ApiMetrics
+from service.api.threads import QUICK, SharedReads
 from service.domain.identifiers import GRID_PATTERN, RUN_PATTERN
 from service.figures.kept import KeptFigures
 from service.runtime import logs
@@ -36,6 +37,7 @@ class Context:
         self.events = EventStore(self.database)
         self.measurements = MeasurementStore(self.database)
         self.tokens = TokenStore(self.database)
+        self.reads = SharedReads(QUICK)
         self.hub = Hub(self.events, settings.max_streams)
         # A connection of their own each time, or probes would queue behind whoever waits for the database already.
         self.probed = Database(settings.database, pooled=False)

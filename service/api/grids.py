@@ -38,7 +38,7 @@ from service.domain.views import (
     RunPage,
     Summary,
 )
-from service.store.grids import NotFoundError
+from service.store.grids import GridStore, NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
 _LOG = logging.getLogger(__name__)
@@ -216,13 +216,20 @@ def retry(grid_id: GridId, service: Service, caller: Asking, body: RetryRequest 
 
 
 @router.get("/runs/{run_id}", response_model=RunDetail, responses=NOT_MODIFIED)
-def show_run(request: Request, run_id: RunId, service: Service, if_none_match: IfNoneMatch = None) -> Response:
+async def show_run(request: Request, run_id: RunId, service: Service, if_none_match: IfNoneMatch = None) -> Response:
     """One run: specification, state, result, attempts."""
-    # Looked at before the run is read: where it changes in between, the next answer differs from this tag.
-    tag = weak_tag(request, *service.grids.run_version(run_id))
-    if is_known(tag, if_none_match):
-        return not_modified(tag)
-    return _written(link_document(service.grids.run_document(run_id)), {"ETag": tag, **REVALIDATED})
+    if if_none_match is not None:
+        tag = weak_tag(request, *await service.reads.ask(service.grids.run_version, run_id))
+        if is_known(tag, if_none_match):
+            return not_modified(tag)
+    version, body = await service.reads.ask(_run_body, service.grids, run_id)
+    return Response(body, media_type="application/json", headers={"ETag": weak_tag(request, *version), **REVALIDATED})
+
+
+def _run_body(grids: GridStore, run_id: str) -> tuple[tuple[Any, ...], bytes]:
+    """What the document of a run changes with, and the document as it is sent."""
+    version, document = grids.run_document(run_id)
+    return version, to_json(link_document(document))
 
 
 @router.get("/runs/{run_id}/figure", response_class=Response, responses=_PNG)  # type: ignore[arg-type]

@@ -7,11 +7,11 @@ import bisect
 import logging
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import Context
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from fastapi.sse import format_sse_event
 from sqlalchemy.exc import DBAPIError
@@ -23,6 +23,7 @@ from service.store.database import AWAY
 from service.store.grids import NotFoundError
 from service.store.outbox import EventStore
 
+T = TypeVar("T")
 _LOG = logging.getLogger(__name__)
 _LOOK_S = 0.5
 _PAGE = 500
@@ -89,7 +90,12 @@ class Feed:
             changed = self._changed
             if self._floor is not None:
                 if after < self._floor:
-                    page = await run_in(EVENTS, self._events.page, self._grid_id, after, limit)
+                    page = await self._page(after, limit)
+                    if page is None:
+                        if time.monotonic() > until:
+                            return News((), ended=False)
+                        await asyncio.sleep(_LOOK_S)
+                        continue
                     if page.items:
                         return News([Told.of(view) for view in page.items], ended=False)
                     after = self._floor
@@ -130,23 +136,32 @@ class Feed:
         """Read on until the grid has ended; a database that is away is asked again."""
         after = 0
         while not self._ended:
-            try:
-                if self._floor is None:
-                    after = self._floor = await run_in(EVENTS, self._events.latest, self._grid_id)
-                    self._tell()
-                page = await run_in(EVENTS, self._events.page, self._grid_id, after, _PAGE)
-            except NotFoundError:
-                page = EventPage(items=[], cursor=after, ended=True, next=None)
-            except (DBAPIError, PoolTimeoutError) as error:
-                if isinstance(error, DBAPIError) and not isinstance(error, AWAY):
-                    raise
-                _LOG.warning("events of %s are not known now: %s", self._grid_id, error)
+            if self._floor is None and (latest := await self._look(self._events.latest)) is not None:
+                after = self._floor = latest
+                self._tell()
+            page = None if self._floor is None else await self._page(after, _PAGE)
+            if page is not None:
+                self._take(page)
+                after = page.cursor
+            if page is None or page.next is None:
                 await asyncio.sleep(_LOOK_S)
-                continue
-            self._take(page)
-            after = page.cursor
-            if page.next is None:
-                await asyncio.sleep(_LOOK_S)
+
+    async def _page(self, after: int, limit: int) -> EventPage | None:
+        """Events of the database above a number, the end where the grid is no more; None while it is away."""
+        try:
+            return await self._look(self._events.page, after, limit)
+        except NotFoundError:
+            return EventPage(items=[], cursor=after, ended=True, next=None)
+
+    async def _look(self, ask: Callable[..., T], *arguments: int) -> T | None:
+        """What the database answers of this grid; None while it is away, so that whoever follows waits for it."""
+        try:
+            return await run_in(EVENTS, ask, self._grid_id, *arguments)
+        except (DBAPIError, PoolTimeoutError) as error:
+            if isinstance(error, DBAPIError) and not isinstance(error, AWAY):
+                raise
+            _LOG.warning("events of %s are not known now: %s", self._grid_id, error)
+            return None
 
     def _take(self, page: EventPage) -> None:
         for view in page.items:

@@ -68,7 +68,7 @@ def show_record(run_id: RunId, service: Service) -> Response:
 
 def _stored(service: Context, run_id: str) -> dict[str, Any]:
     """A run with its result as plain data."""
-    found = service.grids.run_document(run_id)
+    _, found = service.grids.run_document(run_id)
     if found["result"] is None:
         raise NotFoundError(f"run {run_id} has no result")
     return found

@@ -27,18 +27,18 @@ async def await_grid(service: Context, grid_id: str, wait_s: float, is_awaited: 
         As many as may are waiting already.
     """
     until = time.monotonic() + wait_s
-    grid = await run_in(QUICK, service.grids.grid, grid_id)
+    grid = await service.reads.ask(service.grids.grid, grid_id)
     if not wait_s or is_awaited(grid):
         return grid
     with service.hub.follow(grid_id) as feed:
         # The number first: what comes between the two is told, and looked at once more.
         after = await run_in(QUICK, service.events.latest, grid_id)
-        grid = await run_in(QUICK, service.grids.grid, grid_id)
+        grid = await service.reads.ask(service.grids.grid, grid_id)
         while not is_awaited(grid) and (left := until - time.monotonic()) > 0.0:
             news = await feed.next(after, _BATCH, left)
             if not news.told:
                 # The time is up, the server stops, or nothing will follow.
                 break
             after = news.told[-1].number
-            grid = await run_in(QUICK, service.grids.grid, grid_id)
+            grid = await service.reads.ask(service.grids.grid, grid_id)
     return grid

@@ -68,6 +68,13 @@ _SQLITE_REOPENED = frozenset(
         sqlite3.SQLITE_NOTADB,
     }
 )  # fmt: skip
+# Without room for a write a connection still reads, and a new one could not be opened: SQLite writes for that too.
+_SQLITE_NO_ROOM = frozenset(
+    {
+        sqlite3.SQLITE_IOERR_WRITE, sqlite3.SQLITE_IOERR_FSYNC, sqlite3.SQLITE_IOERR_TRUNCATE,
+        sqlite3.SQLITE_IOERR_SHMSIZE,
+    }
+)  # fmt: skip
 _SQLITE_AWAY = frozenset(
     {
         sqlite3.SQLITE_PERM, sqlite3.SQLITE_ABORT, sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM,
@@ -137,6 +144,7 @@ def _lost_session(orig: BaseException) -> bool:
     """Whether the connection is of no more use, though its driver may think otherwise."""
     if isinstance(orig, sqlite3.Error):
         # One that was opened while the file was read-only stays so, whatever becomes of the file.
-        return getattr(orig, "sqlite_errorcode", 0) & 0xFF in _SQLITE_REOPENED
+        code = getattr(orig, "sqlite_errorcode", 0)
+        return code & 0xFF in _SQLITE_REOPENED and code not in _SQLITE_NO_ROOM
     sqlstate: Any = getattr(orig, "sqlstate", None) or ""
     return sqlstate[:2] in {"08", "26", "34"} or sqlstate in {_DUPLICATE_PREPARED, "25P03", "57P01", "57P02", "57P05"}

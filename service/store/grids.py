@@ -73,12 +73,14 @@ _COUNTS = (
     .group_by(run.c.grid_id, run.c.state)
 )
 _RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
+_VERSION_OF_RUN = ("state", "attempt", "suspect", "finished_at", "error_code", "error_detail")
+_VERSION_OF_RESULT = ("payload_digest", "stored_at", "figure", "products")
 _RUN_VERSION = (
     select(
-        *(run.c[name] for name in ("state", "attempt", "suspect", "finished_at", "error_code", "error_detail")),
+        *(run.c[name] for name in _VERSION_OF_RUN),
         # They may be pruned.
         select(func.count()).where(attempt.c.run_id == run.c.id).correlate(run).scalar_subquery(),
-        *(result.c[name] for name in ("payload_digest", "stored_at", "figure", "products")),
+        *(result.c[name] for name in _VERSION_OF_RESULT),
     )
     .join(grid, grid.c.id == run.c.grid_id)
     .outerjoin(result, result.c.run_id == run.c.id)
@@ -241,10 +243,10 @@ class GridStore:
 
     def run(self, wanted: str) -> RunDetail:
         """One run with result and attempts, checked."""
-        return RunDetail.model_validate(self.run_document(wanted))
+        return RunDetail.model_validate(self.run_document(wanted)[1])
 
-    def run_document(self, wanted: str) -> dict[str, Any]:
-        """The same as plain data, from one picture of the database, so that its parts fit each other."""
+    def run_document(self, wanted: str) -> tuple[tuple[Any, ...], dict[str, Any]]:
+        """Its :meth:`run_version`, and the same as plain data: one picture of the database, whose parts fit."""
         parameters = {"wanted": wanted}
         with self._database.read() as connection:
             row = connection.execute(_RUN, parameters).one_or_none()
@@ -253,7 +255,9 @@ class GridStore:
             found = connection.execute(_RESULT, parameters).one_or_none()
             estimates = [] if found is None else connection.execute(_ESTIMATES, parameters).all()
             attempts = connection.execute(_ATTEMPTS, parameters).all()
-        return run_document(row, found, estimates, attempts)
+        version = [getattr(row, name) for name in _VERSION_OF_RUN]
+        version += [len(attempts), *(None if found is None else getattr(found, name) for name in _VERSION_OF_RESULT)]
+        return tuple(version), run_document(row, found, estimates, attempts)
 
     def owner(self, grid_id: str) -> str | None:
         """Whose grid it is; a NotFoundError where there is none."""

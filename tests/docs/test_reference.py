@@ -8,7 +8,6 @@ import re
 import pytest
 from pydantic_core import PydanticUndefined
 
-from engine.measure import POOR_FIT
 from engine.parametric.constraints import (
     CENTRE_PRIOR,
     ELLIPTICITY_PRIOR,
@@ -16,6 +15,7 @@ from engine.parametric.constraints import (
     SHEAR_PRIOR,
     SLOPE_PRIOR,
 )
+from engine.reconstruction import POOR_FIT
 from service.domain.states import TRANSITIONS, RunState
 from service.runtime.settings import Settings
 from tests.docs.openapi import FILE, document_text

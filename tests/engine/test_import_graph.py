@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import engine
+from tests.sources import parsed
 
 ROOT = Path(engine.__file__).parent
 MODULES = sorted(ROOT.rglob("*.py"))
@@ -24,7 +25,7 @@ NAMES = {module_name(path) for path in MODULES}
 
 def imported(path: Path) -> Iterator[str]:
     """Modules that a module imports, wherever in it the import stands."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -11,6 +11,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.sources import parsed
+
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "hard-cases.md"
 ORDER = ("lenses", "light", "inversions", "precision", "chains", "hosts", "size", "no_sentinels")
@@ -70,7 +72,7 @@ def make_page() -> str:
     """The whole page."""
     parts = [HEAD]
     for name in ORDER:
-        tree = ast.parse((HERE / f"test_{name}.py").read_text(encoding="utf-8"))
+        tree = parsed(HERE / f"test_{name}.py")
         about = (ast.get_docstring(tree) or "").splitlines()[0]
         tests = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]
         rows = [_row(read_case(test)) for test in tests]

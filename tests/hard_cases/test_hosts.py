@@ -178,11 +178,6 @@ def test_agn_images_a_twentieth_of_an_arcsecond_apart_do_not_lead_the_host_astra
     assert 1.5 < close.chi2 / close.degrees_of_freedom < 2.5
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="run has no status beside the chain's: a chi^2 of 1.9 per degree of freedom, where the pair of AGN is not "
-    "described, stands in the result without a warning",
-)
 def test_a_run_whose_model_does_not_describe_the_image_warns(close: RunResult) -> None:
     """The same pair: chi^2 per degree of freedom is 1.9.
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import engine
+from tests.sources import parsed
 
 SOURCES = sorted(Path(engine.__file__).parent.rglob("*.py"))
 
@@ -17,7 +18,7 @@ ANSWERS_FOR_ERRORS = {
 def _trees() -> Iterator[tuple[str, ast.Module]]:
     root = Path(engine.__file__).parent
     for path in SOURCES:
-        yield path.relative_to(root).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
+        yield path.relative_to(root).as_posix(), parsed(path)
 
 
 def _functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:

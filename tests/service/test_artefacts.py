@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import subprocess
 import tempfile
 import threading
@@ -35,6 +34,7 @@ from service.store.leases import Lease
 from service.store.queue import Failure
 from service.worker.tasks import call_task
 from tests.service.plans import body
+from tests.service.small_files import small_files
 from tests.service.tasks import PNG, synthetic_payload
 from tests.service.test_api import assert_problem, work
 from tests.service.test_dispatcher import InstantPool, Setting, outcomes
@@ -71,17 +71,6 @@ def away(folder: Path) -> Iterator[None]:
     finally:
         folder.unlink()
         aside.rename(folder)
-
-
-@contextmanager
-def small_files(limit: int) -> Iterator[None]:
-    """No file of this process may grow beyond ``limit`` bytes: a write fails where one to a full disk would."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.fixture
@@ -445,25 +434,34 @@ def planned_spec(setting: Setting) -> dict[str, Any]:
     return setting.grids.run(run.id).spec
 
 
-def test_held_results_of_a_cancelled_grid_are_dropped_and_those_of_a_stopped_dispatcher_given_back(
-    database: Database, tmp_path: Path
-) -> None:
-    setting = setting_of(database, tmp_path)
+def test_held_results_of_a_stopped_dispatcher_are_given_back(database: Database, tmp_path: Path) -> None:
+    setting = held(database, tmp_path)
     with away(setting.pool.folder):
-        setting.dispatcher._backlog._next = time.monotonic() + 60
-        setting.run(steps=10)
         setting.dispatcher.hand_back()
         assert setting.grids.grid(setting.grid_id).counts.queued == 6
         assert setting.dispatcher._backlog.leases == []
-    setting.run(until=lambda: len(setting.pool.submitted) >= 4, steps=2000)
+    assert {end for run in outcomes(setting) for end in run} == {"handed_back"}
+
+
+def test_held_results_of_a_cancelled_grid_are_dropped(database: Database, tmp_path: Path) -> None:
+    setting = held(database, tmp_path)
     with away(setting.pool.folder):
-        setting.dispatcher._backlog._next = time.monotonic() + 60
-        setting.run(until=lambda: bool(setting.dispatcher._backlog.leases), steps=2000)
         setting.grids.cancel(setting.grid_id)
         setting.dispatcher._due.clear()
         setting.run(steps=500)
         assert setting.grids.grid(setting.grid_id).finished_at is not None
-    assert {end for run in outcomes(setting) for end in run} <= {"done", "handed_back", "cancelled"}
+        assert setting.dispatcher._backlog.leases == []
+    assert {end for run in outcomes(setting) for end in run} == {"cancelled"}
+
+
+def held(database: Database, folder: Path) -> Setting:
+    """A dispatcher that holds results which its store, away, did not take."""
+    setting = setting_of(database, folder)
+    with away(setting.pool.folder):
+        setting.dispatcher._backlog._next = time.monotonic() + 60
+        setting.run(until=lambda: len(setting.dispatcher._backlog.leases) == 4)
+        assert len(setting.dispatcher._backlog.leases) == 4
+    return setting
 
 
 def lease(number: int) -> Lease:

@@ -51,16 +51,16 @@ def one_api_process(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "drill",
     [
-        DispatcherKills(runs=24, kills=2),
-        WorkerKills(runs=24, every_s=1.0, workers=2),
-        pytest.param(PostgresKills(runs=40, every_s=1.5), marks=pytest.mark.postgres),
+        DispatcherKills(runs=16, kills=1),
+        WorkerKills(runs=16, every_s=1.0, workers=2),
+        pytest.param(PostgresKills(runs=24, every_s=1.5), marks=pytest.mark.postgres),
         # Long enough for a read on a busy machine to end before half of it has gone.
         SqliteLock(runs=8, lock_s=6.0),
         DiskFull(runs=8, full_s=1.5),
         StoreAway(runs=12, away_s=2.0),
         StoppedWorker(runs=6),
         TwoDispatchers(runs=20),
-        Poison(runs=24),
+        Poison(runs=12),
     ],
     ids=lambda drill: drill.name,
 )

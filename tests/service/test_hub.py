@@ -130,17 +130,24 @@ class Failing(Counted):
         return super().page(grid_id, after, limit)
 
 
-def test_followers_wait_through_an_absence_of_the_database(database: Database, grid: str) -> None:
+@pytest.mark.parametrize("behind", [False, True])
+def test_followers_wait_through_an_absence_of_the_database(database: Database, grid: str, behind: bool) -> None:
+    """Also who is behind what is kept, and asks the database by himself."""
+
     async def follow() -> None:
         events = Failing(database)
         hub = Hub(events, most=1)
         after = events.latest(grid)
+        if behind:
+            happen(database, grid, 5)
         with hub.follow(grid) as feed:
-            waiting = asyncio.create_task(told(feed, 5, after))
+            await until(lambda: events.looks > 0)
             events.error = OperationalError("SELECT", {}, Exception("the database is away"))
+            waiting = asyncio.create_task(told(feed, 5, after))
             looks = events.looks
-            await asyncio.to_thread(happen, database, grid, 5)
-            await until(lambda: events.looks > looks + 2)
+            if not behind:
+                await asyncio.to_thread(happen, database, grid, 5)
+            await until(lambda: events.looks > looks + 4)
             assert not waiting.done()
             events.error = None
             assert await waiting == list(range(5))

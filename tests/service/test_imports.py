@@ -8,13 +8,14 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import service
+from tests.sources import parsed
 
 FOLDER = Path(service.__file__).parent
 
 
 def imports(file: Path) -> Iterator[str]:
     """Every module that a file names in an import, wherever it stands: also for types, also within a function."""
-    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+    for node in ast.walk(parsed(file)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):

@@ -1,4 +1,4 @@
-"""The state machine of :mod:`tests.service.queue_model` on both databases: a thousand steps on each, or 100,000."""
+"""The state machine of :mod:`tests.service.queue_model` on both databases: five hundred steps on each, or 100,000."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from tests.service.queue_model import check
 
-EXAMPLES, LEAST = 60, 1000
+EXAMPLES, LEAST = 30, 500
 
 
 def test_the_queue_holds_its_promises_on_sqlite(migrated_sqlite: Path, tmp_path: Path) -> None:

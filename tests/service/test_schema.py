@@ -91,7 +91,7 @@ CASES = settings(
 )
 
 
-@pytest.mark.parametrize(("each", "least"), [(15, 200), pytest.param(120, 2000, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("each", "least"), [(5, 80), pytest.param(120, 2000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("mode", list(GenerationMode))
 def test_no_request_that_fits_or_breaks_the_schema_gives_a_5xx(
     schema: schemathesis.schemas.BaseSchema, mode: GenerationMode, each: int, least: int

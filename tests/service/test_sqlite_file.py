@@ -25,6 +25,7 @@ from service.store.grids import GridStore
 from service.store.tables import grid, run
 from tests.service.plans import body, submit
 from tests.service.service_process import eventually, serving
+from tests.service.small_files import small_files
 
 
 @pytest.fixture
@@ -39,6 +40,20 @@ def locked(file: Path) -> Iterator[None]:
         other.execute("BEGIN IMMEDIATE")
         yield
         other.execute("ROLLBACK")
+
+
+def test_a_write_that_finds_no_room_costs_no_reader_its_connection(sqlite_url: str) -> None:
+    """A new one could not be opened where nobody else has the file open: its index is a file that has to grow."""
+    database = Database(sqlite_url)
+    with closing(database.reader.raw_connection()) as kept:
+        driver = kept.driver_connection
+    with small_files(4096), pytest.raises(DatabaseAwayError):
+        submit(GridStore(database), 100)
+    with small_files(4096), database.read() as connection:
+        assert connection.connection.driver_connection is driver
+        assert connection.scalar(select(func.count()).select_from(run)) == 0
+    submit(GridStore(database), 1)
+    database.close()
 
 
 @pytest.mark.parametrize("writers", [20, 60])

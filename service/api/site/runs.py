@@ -18,7 +18,7 @@ router = APIRouter(include_in_schema=False, route_class=Route)
 @router.get("/runs/{run_id}")
 def one_run(request: Request, run_id: RunId, service: Service) -> Response:
     """One run."""
-    run = service.grids.run_document(run_id)
+    _, run = service.grids.run_document(run_id)
     grid = service.grids.grid(run["grid_id"])
     result = run["result"]
     names = sorted(ESTIMATES, key=lambda name: name != RECOMMENDED)
