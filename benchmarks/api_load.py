@@ -3,6 +3,7 @@
 ``python -m benchmarks.api_load`` starts a real API over a database with a grid of 3,000 runs that another process
 finishes at 20 a second, checks what each address answers, and then asks from 50 keep-alive connections, each as fast as
 it is answered. The client is one process that does nothing but send prepared bytes and find the end of the answer.
+What waits for a thread is read once for all who ask for it: 50 runs, one for each connection, cost more than one.
 CPU per request counts all API processes; unlike the latencies it does not depend on what else the machine does.
 
 ``--against FOLDER`` measures another checkout in the same run; ``--streams N`` holds so many event streams open
@@ -122,7 +123,7 @@ def processor_s(process: psutil.Process) -> float:
     return sum(found.user + found.system for found in times)
 
 
-def check(base: str, grid: str, run: str) -> dict[str, str]:
+def check(base: str, grid: str, run: str) -> dict[str, list[str]]:
     """The addresses that are measured, after each was seen to answer with what it should."""
     with httpx.Client(base_url=base, timeout=10.0) as client:
         eventually(lambda: _answers(client), what="an answer")
@@ -133,11 +134,14 @@ def check(base: str, grid: str, run: str) -> dict[str, str]:
         assert (detail["id"], detail["state"], detail["result"]["degrees_of_freedom"] > 0) == (run, "done", True)
         assert len(client.get("/v1/systems").json()["items"]) > 1
         assert client.get("/healthz").json()["status"] == "ok"
+        page = client.get(f"/v1/grids/{grid}/runs", params={"state": "done", "limit": CLIENTS}).json()["items"]
+        assert len({one["id"] for one in page}) == CLIENTS
     return {
-        "/healthz": "/healthz",
-        "/v1/systems": "/v1/systems",
-        "/v1/grids/{id}": f"/v1/grids/{grid}",
-        "/v1/runs/{id}": f"/v1/runs/{run}",
+        "/healthz": ["/healthz"],
+        "/v1/systems": ["/v1/systems"],
+        "/v1/grids/{id}": [f"/v1/grids/{grid}"],
+        "/v1/runs/{id}": [f"/v1/runs/{run}"],
+        "a run for each": [f"/v1/runs/{one['id']}" for one in page],
     }
 
 
@@ -179,13 +183,13 @@ class Connection:
         return self.left == 0
 
 
-def load(port: int, address: str, clients: int, seconds: float) -> Sample:
-    """Ask for one address from so many connections for so long."""
-    request = f"GET {address} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+def load(port: int, addresses: Sequence[str], clients: int, seconds: float) -> Sample:
+    """Ask for these addresses, in turn one for each of so many connections, for so long."""
+    requests = [f"GET {address} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode() for address in addresses]
     sample = Sample()
     with selectors.DefaultSelector() as ready:
-        for _ in range(clients):
-            connection = Connection(port, request)
+        for number in range(clients):
+            connection = Connection(port, requests[number % len(requests)])
             ready.register(connection.socket, selectors.EVENT_READ, connection)
             connection.ask()
         began = time.perf_counter()
@@ -264,10 +268,10 @@ def measure(tree: Path, options: argparse.Namespace) -> None:
             addresses = check(base, grid, run)
             with started(*busy, PYTHONPATH=str(tree)):
                 print(f"{tree}\n{'':18s} answers    1/s   p50 ms   p99 ms   max ms   CPU ms")
-                for name, address in addresses.items():
-                    load(port, address, options.clients, 1.0)
+                for name, asked in addresses.items():
+                    load(port, asked, options.clients, 1.0)
                     before = processor_s(api)
-                    sample = load(port, address, options.clients, options.seconds)
+                    sample = load(port, asked, options.clients, options.seconds)
                     sample.cpu_s = (processor_s(api) - before) / len(sample.latencies)
                     print(f"{name:16s} {sample.row()}", flush=True)
                 if options.streams:

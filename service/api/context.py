@@ -12,6 +12,7 @@ from service.api.threads import QUICK, SharedReads
 from service.domain.identifiers import GRID_PATTERN, RUN_PATTERN
 from service.figures.kept import KeptFigures
 from service.runtime import logs
+from service.runtime.kept import KeptBytes
 from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
 from service.store.costs import CostStore
@@ -22,7 +23,7 @@ from service.store.measurements import MeasurementStore
 from service.store.outbox import EventStore
 from service.store.tokens import TokenStore
 
-_KEPT_BYTES = 32 * 2**20
+_KEPT_FIGURES, _KEPT_RUNS = 32 * 2**20, 16 * 2**20
 _IDS = frozenset({"grid_id", "run_id"})
 
 
@@ -44,7 +45,8 @@ class Context:
         self.leadership = Leadership(self.probed, settings.leader_ttl_s)
         self.metrics = ApiMetrics(self.database, self.leadership)
         self.artefacts = ArtefactStore(settings.artefacts, patience_s=10.0)
-        self.figures = KeptFigures(_KEPT_BYTES)
+        self.figures = KeptFigures(_KEPT_FIGURES)
+        self.runs = KeptBytes(_KEPT_RUNS)
 
 
 async def _context(request: Request) -> Context:
