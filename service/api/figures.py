@@ -21,8 +21,8 @@ from service.figures.drawing import drawn
 from service.figures.montage import montage, read_arrays
 from service.figures.question import FIGURE_KINDS, FigureFormat, FigureKind, FigureQuestion, OfPoints, Prior
 from service.store.bias_rows import TooManyPointsError, bias_points, content, montage_runs
-from service.store.grids import NotFoundError
 from service.store.result_filter import ResultFilter
+from service.store.runs import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["figures"], route_class=Route)
 _DRAWING = DrawingProcess()

@@ -32,7 +32,7 @@ from service.domain.measurements import (
 )
 from service.domain.views import MeasurementPage, MeasurementView
 from service.store.artefacts import ArtefactStore
-from service.store.grids import NotFoundError
+from service.store.runs import NotFoundError
 
 ADDRESS = "/v1/measurements"
 router = APIRouter(prefix="/v1", tags=["measurements"], route_class=Route)
