@@ -95,7 +95,7 @@ def of_grid(
     grid = service.grids.grid(grid_id)
     where = read_filter(query.model_copy(update={"grid": [grid_id]}))
     return _answer(
-        service, _Wanted(_question(figure, query), where, grid.name or grid.id, kind, grid_id), if_none_match
+        service, _Wanted(_question(figure, query), where, grid.name or "", kind, grid_id), if_none_match
     )
 
 

@@ -86,6 +86,13 @@ def test_every_figure_of_a_grid_is_drawn_as_svg_and_png(api: TestClient, setting
             assert api.get(f"/v1/figures/{kind}.svg?system=HE0435").status_code == 200
 
 
+def test_the_title_of_a_grid_without_a_name_is_not_its_identifier(api: TestClient, settings: Settings) -> None:
+    grid_id = grid(api, {**BODY, "replicates": 2})
+    work(settings)
+    for kind in ("bias", "montage"):
+        assert grid_id not in api.get(f"/v1/grids/{grid_id}/figures/{kind}.svg").text
+
+
 def test_a_figure_shows_the_runs_that_the_filter_means(api: TestClient, settings: Settings) -> None:
     one, other = (grid(api, {**TWO, "seed": seed}) for seed in (0, 100))
     work(settings)
