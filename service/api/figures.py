@@ -94,9 +94,7 @@ def of_grid(
         raise InvalidRequestError("query", "grid", "grid: the address names one already")
     grid = service.grids.grid(grid_id)
     where = read_filter(query.model_copy(update={"grid": [grid_id]}))
-    return _answer(
-        service, _Wanted(_question(figure, query), where, grid.name or "", kind, grid_id), if_none_match
-    )
+    return _answer(service, _Wanted(_question(figure, query), where, grid.name or "", kind, grid_id), if_none_match)
 
 
 def install(app: FastAPI) -> None:
