@@ -7,8 +7,6 @@ from pathlib import Path
 # Before anything loads them: several processes of tests share the machine, and a worker of the service has one core.
 for _library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
-# What Starlette's client calls every application, and requests that are written by hand.
-os.environ.setdefault("HOSTLENS_ALLOWED_HOSTS", '["testserver", "a"]')
 
 import pytest  # noqa: E402 - after the variables
 from xdist.remote import Producer  # noqa: E402

@@ -35,10 +35,10 @@ class Gate:
     """Answers 401 to whom no token lets in and 403 to whom it does not let so far; asks nobody without ``tokens``.
 
     A token comes in the header Authorization, or from a browser in a cookie. A browser sends its cookies, and reaches a
-    service that asks for no token, on behalf of whatever page it shows: what changes anything is only taken from
-    pages of this service. Where ``hosts`` are given, a request has to call the service by one of them or by a name of
-    loopback, else it is 421: another site's name may be made to lead here (DNS rebinding), and its pages would be taken
-    for ours.
+    service that asks for no token, on behalf of whatever page it shows: what changes anything is only taken from pages
+    of this service. Where ``hosts`` are given, a request has to call the service by one of them, a name of loopback or
+    one without a dot, else it is 421: another site's name may be made to lead here (DNS rebinding), and its pages would
+    be taken for ours.
     """
 
     def __init__(self, app: ASGIApp, tokens: TokenStore | None, hosts: frozenset[str] | None = None) -> None:
@@ -109,10 +109,13 @@ def _cookie(headers: Headers) -> str | None:
 
 
 def _is_called(called: str, hosts: frozenset[str]) -> bool:
-    """Whether the header Host names one of the hosts, or this machine as browsers find it without asking anybody."""
+    """Whether the header Host names one of the hosts, or what nobody elsewhere can make lead here.
+
+    That is loopback, and any name without a dot: it is of this machine or its network, never of somebody's site.
+    """
     try:
         name = urlsplit(f"//{called}").hostname or ""
-        if name in hosts or name == "localhost" or name.endswith(".localhost"):
+        if name in hosts or name.endswith(".localhost") or not {".", ":"} & set(name):
             return True
         return ipaddress.ip_address(name).is_loopback
     except ValueError:

@@ -80,8 +80,8 @@ class Settings(LogSettings):
     """Whether the API asks for tokens; where None, unless it listens on loopback. ``off`` elsewhere is for a proxy or a
     firewall that asks who comes; ``tokens`` on loopback for a proxy that does not."""
     allowed_hosts: Hosts = Field(default_factory=list)
-    """Names that requests may call the API by beside those of loopback, as a JSON list. Without any, requests to a
-    service that asks nobody on loopback have to call it by those, and to any other as they like."""
+    """Names that requests may call the API by beside those of loopback and those without a dot, as a JSON list. Without
+    any, requests to a service that asks nobody on loopback have to call it by those, and to any other as they like."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 1_000_000
     max_upload_bytes: Annotated[int, Field(ge=10_000, le=2**33)] = 64_000_000
     """Of the files of a measurement together."""

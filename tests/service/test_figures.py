@@ -71,6 +71,8 @@ def detail(answer: object, status: int) -> str:
     return str(answer.json()["detail"])
 
 
+# What is drawn comes from the same models on both; what is asked of a database is asked below.
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 def test_every_figure_of_a_grid_is_drawn_as_svg_and_png(api: TestClient, settings: Settings) -> None:
     grid_id = grid(api, {**TWO, "name": "two <systems>"})
     work(settings)

@@ -277,7 +277,7 @@ def test_what_changes_anything_is_taken_from_no_page_of_another_site(
     [
         ("localhost", 200), ("LOCALHOST:8421", 200), ("a.localhost", 200), ("127.1.2.3:1", 200), ("[::1]:8421", 200),
         ("evil.example", 421), ("localhost.evil.example:8421", 421), ("192.0.2.1", 421), ("[2001:db8::1]", 421),
-        ("[::1", 421), ("lens.example.org", 421),
+        ("[::1", 421), ("lens.example.org", 421), ("observatory:8421", 200),
     ],
 )  # fmt: skip
 def test_a_name_that_was_made_to_lead_to_loopback_leads_to_nothing(
