@@ -22,9 +22,10 @@ Role = Literal["image", "noise", "psf", "valid", "dq", "weight"]
 Slices = tuple[slice, slice]
 LIBRARY_ERRORS = (
     OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, ArithmeticError, EOFError, MemoryError,
-    RecursionError, fits.VerifyError, struct.error, zlib.error,
+    RuntimeError, NameError, AssertionError, fits.VerifyError, struct.error, zlib.error,
 )  # fmt: skip
-"""What the libraries underneath raise at files that break a rule; those of WCS and units are ValueErrors."""
+"""What the libraries underneath raise at files that break a rule; those of WCS and units are ValueErrors, and Astropy
+raises a NameError at a D2IMDIS that is no LOOKUP."""
 NAMES: dict[Role, tuple[str, ...]] = {
     "image": ("SCI", "IMAGE"),
     "noise": ("ERR", "NOISE", "RMS", "SIGMA", "STD", "ERROR"),

@@ -531,6 +531,7 @@ DISTORTIONS = {
     },
     "half a SIP": {"A_ORDER": 2, "A_2_0": 1e-6},
     "D2IM": {"D2IMDIS1": "LOOKUP", "D2IM1.EXTVER": 1.0},
+    "D2IM of no kind": {"D2IMDIS1": "GARBAGE"},
 }
 
 
