@@ -26,6 +26,7 @@ _LIKELY_WIDTHS, _POSSIBLE_WIDTHS = (0.03, 0.6), (0.005, 5.0)
 _LIKELY_MAGNITUDES = (13.5, 27.0)
 _LIKELY_SCATTER, _POSSIBLE_SCATTER = (0.3, 2.5), (0.05, 8.0)
 """Of the empty sky over the noise map; drizzled images have 0.5 to 0.7."""
+_SECOND_DIFFERENCES = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
 _SKY_WINDOW, _FAINTEST_PERCENT, _FEWEST_PIXELS = 11, 25.0, 400
 _SHARP = 1.3
 """Sharpness of an image's sharpest peak over the PSF's from which on the PSF is too broad."""
@@ -106,30 +107,42 @@ def _look_at_light(observation: Observation, found: Findings) -> None:
 
 
 def _look_at_noise(observation: Observation, found: Findings) -> None:
-    ratio = scatter_ratio(observation)
-    if ratio is None:
+    scatter = sky_scatter(observation)
+    if scatter is None:
         return
+    least, most = scatter
     low, high = _POSSIBLE_SCATTER
-    if not low <= ratio <= high:
+    if most < low or least > high:
         found.contradict(
-            f"noise: the sky scatters by {ratio:.3g} of its map, possible are {low:g} to {high:g}: is it 1 sigma, "
-            "and no variance or weight?"
+            f"noise: the sky scatters by {most if most < low else least:.3g} of its map, possible are {low:g} to "
+            f"{high:g}: is it 1 sigma, and no variance or weight?"
         )
-    elif not _LIKELY_SCATTER[0] <= ratio <= _LIKELY_SCATTER[1]:
-        found.note(f"noise: the sky scatters by {ratio:.2f} of its map")
+    elif most < _LIKELY_SCATTER[0] or least > _LIKELY_SCATTER[1]:
+        found.note(f"noise: the sky scatters by {most if most < _LIKELY_SCATTER[0] else least:.2f} of its map")
 
 
-def scatter_ratio(observation: Observation) -> float | None:
-    """Scatter of the faintest quarter of an image over its noise map; None where there is too little of it."""
+def sky_scatter(observation: Observation) -> tuple[float, float] | None:
+    """Scatter of the faintest quarter of an image over its noise map, at least and at most; None with too little of it.
+
+    At most: about the median of 11 x 11 pixels, which arcs leave something of where the field is small. At least: by
+    the differences of second differences of neighbours (Immerkaer 1996), which leave nothing of what is smooth, and
+    less of the noise that neighbours share.
+    """
     image, valid = observation.image, observation.valid
     # What is masked has no bounds, and many mask by a noise beyond all measure.
     usable = valid & (observation.noise < 100.0 * float(np.median(observation.noise[valid])))
     if np.count_nonzero(usable) < _FEWEST_PIXELS:
         return None
-    smooth = ndimage.median_filter(np.where(valid, image, float(np.median(image[valid]))), _SKY_WINDOW)
+    filled = np.where(valid, image, float(np.median(image[valid])))
+    smooth = ndimage.median_filter(filled, _SKY_WINDOW)
     faint = usable & (smooth <= np.percentile(smooth[usable], _FAINTEST_PERCENT))
-    z = (image - smooth)[faint] / observation.noise[faint]
-    return 1.4826 * float(np.median(np.abs(z - np.median(z))))
+    whole = faint & ndimage.binary_erosion(valid, np.ones((3, 3), dtype=bool))
+    rough = ndimage.convolve(filled, _SECOND_DIFFERENCES) / math.sqrt(float((_SECOND_DIFFERENCES**2).sum()))
+    found = [
+        1.4826 * float(np.median(np.abs(values[chosen] / observation.noise[chosen])))
+        for values, chosen in ((rough, whole if whole.any() else faint), (filled - smooth, faint))
+    ]
+    return min(found), max(found)
 
 
 def _look_at_psf(observation: Observation, found: Findings) -> None:
