@@ -236,8 +236,7 @@ def measure_image(
         raise SpecError("seed", seed, "a whole number from 0 to 2^63 - 1")
     require_hints(observation, theta_E, positions)
     warnings = [*observation.notes, *unlikely(observation, trusting=trust_options)]
-    if not trust_options:
-        require_lens(observation)
+    warnings += require_lens(observation, trusting=trust_options)
     rng = np.random.default_rng(seed)
     found = analyse(
         observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,

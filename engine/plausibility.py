@@ -47,11 +47,17 @@ def require_hints(
             )
 
 
-def require_lens(observation: Observation) -> None:
-    """An ObservationError where the image shows noise alone, one star, or one galaxy without an arc."""
+def require_lens(observation: Observation, *, trusting: bool = False) -> tuple[str, ...]:
+    """An ObservationError where the image shows noise alone, one star, or one galaxy without an arc.
+
+    ``trusting``: that is told instead.
+    """
     reason = why_no_lens(observation)
-    if reason is not None:
+    if reason is None:
+        return ()
+    if not trusting:
         raise ObservationError(f"image: {reason}, so there is no lens to measure")
+    return (f"image: {reason}",)
 
 
 def unlikely(observation: Observation, *, trusting: bool = False) -> tuple[str, ...]:

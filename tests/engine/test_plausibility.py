@@ -19,7 +19,7 @@ from engine.imaging.observation import Observation
 from engine.imaging.optics.stamp import StampOptics
 from engine.light.sersic import SersicProfile
 from engine.parametric.detectability import why_no_lens
-from engine.plausibility import sky_scatter, unlikely
+from engine.plausibility import require_lens, sky_scatter, unlikely
 from engine.simulation.simulate import Simulation
 
 SIGMA, SCALE = 0.005, 0.08
@@ -57,6 +57,7 @@ def test_noise_alone_one_star_and_a_galaxy_without_an_arc_are_no_lens() -> None:
         assert said in (why_no_lens(observation) or "")
         with pytest.raises(ObservationError, match=f"image: {said}.*no lens to measure"):
             measure_image(observation, inversion=False)
+    assert require_lens(seen(), trusting=True) == ("image: nothing stands out of its noise",)
 
 
 def test_a_drizzled_deflector_is_no_lens_until_an_arc_is_behind_it() -> None:
