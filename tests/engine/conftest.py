@@ -43,6 +43,12 @@ def simulation(scene: Scene) -> Simulation:
 
 
 @pytest.fixture(scope="session")
+def wide(realization: Realization) -> Simulation:
+    """The same host in the field of the paper: with sky whose scatter can be measured, and the deflector's wings."""
+    return simulate(build_scene(replace(realization, system="HE0435")), "author", np.random.default_rng(1))
+
+
+@pytest.fixture(scope="session")
 def fit(scene: Scene, simulation: Simulation) -> ParametricFit:
     """Of the simulation, its four AGN known; made once for all tests."""
     return fit_parametric(simulation.observation, agn_images=len(scene.agn), fixed_index=HELD_INDEX)

@@ -35,12 +35,6 @@ SHARED_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
 
 @pytest.fixture(scope="module")
-def wide(realization: Realization) -> Simulation:
-    """With enough sky round the lens for its scatter to be known."""
-    return simulate_realization(replace(realization, system="HE0435"))
-
-
-@pytest.fixture(scope="module")
 def found(wide: Simulation) -> ImageMeasurement:
     return measure_image(wide.observation, inversion=False)
 

@@ -204,11 +204,11 @@ def task_of(observation: Observation) -> Task:
     return Task(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
 
 
-def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulation: Simulation) -> None:
+def test_an_agn_image_that_would_leave_its_bounds_is_told(wide: Simulation) -> None:
     # Three pixels from where it is: its bounds are two pixels about where the fit begins.
-    shift = 3.0 * simulation.observation.pixel_scale
-    places = [(agn.x + (shift if k == 0 else 0.0), agn.y) for k, agn in enumerate(scene.agn)]
-    task = task_of(simulation.observation)
+    shift = 3.0 * wide.observation.pixel_scale
+    places = [(agn.x + (shift if k == 0 else 0.0), agn.y) for k, agn in enumerate(wide.scene.agn)]
+    task = task_of(wide.observation)
     (group,) = find_starts(task, None, None, places)
     (found,) = quick_fits(task, group)
     assert "agn1.x" in found.at_bound
@@ -217,13 +217,13 @@ def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulati
     assert not found.at_bound
 
 
-def test_what_strays_from_its_start_fit_by_fit_is_told(simulation: Simulation) -> None:
-    task = task_of(simulation.observation)
+def test_what_strays_from_its_start_fit_by_fit_is_told(wide: Simulation) -> None:
+    task = task_of(wide.observation)
     (group,) = find_starts(task, 4, None, None)
     start = group[0]
     (found,) = quick_fits(task, [start])
     space = found.space
-    low, high = space.bounds(start.vector(space), simulation.observation.pixel_scale, {})
+    low, high = space.bounds(start.vector(space), wide.observation.pixel_scale, {})
     for name in ("agn1.x", "agn2.y", "lens.theta_E", "lens.x", "host.y", "deflector.x"):
         k = space.names.index(name)
         # One fit ends just inside its bounds, and the next one, whose bounds lie round that, goes on from there.
