@@ -94,7 +94,7 @@ def _full(task: Task, solution: Solution, sigma: FloatArray, *, shear: bool) -> 
 def _again(solution: Solution, model: ImageModel) -> Solution:
     """The minimum of a model with derivatives of integrated light, from where another one was."""
     return minimise(
-        model, solution.start, solution.values, INTEGRATED_STEPS, TOLERANCE, integrated=True,
+        model, solution.start, solution.values, INTEGRATED_STEPS, TOLERANCE,
         stamp_error=solution.stamp_error,
     )  # fmt: skip
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -90,19 +89,17 @@ def minimise(
     steps: int,
     tolerance: float,
     *,
-    integrated: bool = False,
     stamp_error: float = 1.0,
 ) -> Solution:
     """Least squares from ``values``, at most ``steps`` of them.
 
-    With ``integrated`` the derivatives are those of the integrated light, not of samples. A PosteriorError tells of a
-    component that puts no light on the image.
+    A PosteriorError tells of a component that puts no light on the image.
     """
     low, high = model.space.bounds(values, model.observation.pixel_scale, model.priors)
     fit = least_squares(
         model.residuals,
         np.clip(values, low + _ROOM, high - _ROOM),
-        partial(model.jacobian, integrated=integrated),
+        model.jacobian,
         (low, high),
         x_scale="jac",
         xtol=tolerance,
@@ -123,7 +120,7 @@ def minimise_held(solution: Solution, values: FloatArray, at: int, held: float) 
     fit = least_squares(
         lambda free: model.residuals(whole(free)),
         np.clip(np.delete(values, at), low + _ROOM, high - _ROOM),
-        lambda free: np.delete(model.jacobian(whole(free), integrated=True), at, axis=1),
+        lambda free: np.delete(model.jacobian(whole(free)), at, axis=1),
         (low, high),
         x_scale="jac",
         xtol=TOLERANCE,
