@@ -87,6 +87,9 @@ class ImageModel:
         self._anchors: dict[int, tuple[float, float, FloatArray]] = {}
         self._deflector = lru_cache(maxsize=4)(self._render_deflector)
         self._host = lru_cache(maxsize=4)(self._render_host)
+        # A search ends with the derivatives where the next one, or the covariance, begins.
+        self._deflector_slopes = lru_cache(maxsize=2)(self._deflector_derivatives)
+        self._host_slopes = lru_cache(maxsize=2)(self._host_derivatives)
 
     def _point(self, index: int, x: float, y: float) -> FloatArray:
         """Column of an AGN image. What the exposures make of it is remembered as long as it moves next to nothing."""
@@ -119,21 +122,28 @@ class ImageModel:
     def _light_derivatives(
         self, profile: SersicProfile, lens: PowerLawLens | None, leaves: Leaves | None
     ) -> FloatArray:
-        """Derivatives (pixels, parameters) of a column of light, by the lens if there is one and the shape."""
+        """Derivatives (parameters, pixels) of a column of light, by the lens if there is one and the shape."""
         blur = self._outer if lens is None else self._inner
         moving = LightDerivatives(profile, lens, shear=self.space.shear)
         if leaves is None:
             fine = moving.sampled(blur.x, blur.y, blur.side)
         else:
             fine = moving.integrated(blur.x, blur.y, blur.side, leaves)
-        return (blur(fine, integrated=self.exact).reshape(moving.size, -1) * self.weight).T
+        return blur(fine, integrated=self.exact).reshape(moving.size, -1) * self.weight
 
     def _render_deflector(self, *values: float) -> tuple[FloatArray, Leaves | None]:
         return self._light(profile_of(values), None)
 
+    def _deflector_derivatives(self, *values: float) -> FloatArray:
+        return self._light_derivatives(profile_of(values), None, self._deflector(*values)[1])
+
     def _render_host(self, *values: float) -> tuple[FloatArray, Leaves | None]:
         split = len(values) - len(SHAPE)
         return self._light(profile_of(values[split:]), lens_of(values[:split]))
+
+    def _host_derivatives(self, *values: float) -> FloatArray:
+        split = len(values) - len(SHAPE)
+        return self._light_derivatives(profile_of(values[split:]), lens_of(values[:split]), self._host(*values)[1])
 
     def corrected(self, values: FloatArray) -> ImageModel:
         """The model of data less what its columns of deflector and host lack of their exact images.
@@ -164,7 +174,7 @@ class ImageModel:
         out = [self._point(k, float(x), float(y)) for k, (x, y) in enumerate(space.agn(values))]
         if space.deflector:
             out.append(self._deflector(*values[space.deflector_slice].tolist())[0])
-        out.append(self._host(*values[space.lens_slice].tolist(), *values[space.host_slice].tolist())[0])
+        out.append(self._host(*values[space.lens_slice.start :].tolist())[0])
         out.append(self.weight)
         return np.stack(out, axis=1)
 
@@ -214,15 +224,10 @@ class ImageModel:
             out[:, 2 * k] = best[k] * self._stamp(x, y, "column")
             out[:, 2 * k + 1] = best[k] * self._stamp(x, y, "row")
         if space.deflector:
-            shape = values[space.deflector_slice]
-            _, leaves = self._deflector(*shape.tolist())
-            slopes = self._light_derivatives(profile_of(shape), None, leaves)
-            out[:, space.deflector_slice] = best[space.n_agn] * slopes
-        lens, host = values[space.lens_slice], values[space.host_slice]
-        _, leaves = self._host(*lens.tolist(), *host.tolist())
-        out[:, space.lens_slice.start :] = best[HOST_FLUX] * self._light_derivatives(
-            profile_of(host), lens_of(lens), leaves
-        )  # fmt: skip
+            where = space.deflector_slice
+            out[:, where] = best[space.n_agn] * self._deflector_slopes(*values[where].tolist()).T
+        where = slice(space.lens_slice.start, space.size)
+        out[:, where] = best[HOST_FLUX] * self._host_slopes(*values[where].tolist()).T
         return out
 
 

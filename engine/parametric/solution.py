@@ -16,8 +16,9 @@ from engine.parametric.point_sources import Detection
 from engine.parametric.starts import Start
 
 TOLERANCE = 1e-6
-"""Relative change of cost or parameters at which a fit with derivatives of integrated light ends."""
-INTEGRATED_STEPS = 15
+"""Relative change of cost or parameters at which a fit of integrated light ends."""
+NEAR_STEPS = 15
+"""Of a fit that begins next to where another one ended."""
 _ROOM = 1e-6
 """How far inside its bounds a fit begins."""
 
@@ -125,6 +126,6 @@ def minimise_held(solution: Solution, values: FloatArray, at: int, held: float) 
         x_scale="jac",
         xtol=TOLERANCE,
         ftol=TOLERANCE,
-        max_nfev=INTEGRATED_STEPS,
+        max_nfev=NEAR_STEPS,
     )
     return replace(solution, values=whole(fit.x), cost=2.0 * float(fit.cost))
