@@ -166,6 +166,7 @@ class ImageModel:
             defect += brightness * (exact.ravel() * self.weight - column)
         out = copy(self)
         out.data = self._observed - defect
+        out._anchors = {}
         return out
 
     def columns(self, values: FloatArray) -> FloatArray:
