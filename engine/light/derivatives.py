@@ -48,7 +48,9 @@ def _shape_derivatives(
 
 
 @inlined_kernel
-def _lens_derivatives(x: float, y: float, by_x: FloatArray, by_y: FloatArray, shape: FloatArray, out: FloatArray) -> None:
+def _lens_derivatives(
+    x: float, y: float, by_x: FloatArray, by_y: FloatArray, shape: FloatArray, out: FloatArray
+) -> None:
     """Derivatives by the lens, with shear or without, at the image position (x, y): of where its ray meets the shape."""
     for k in range(LENS_DERIVATIVES):
         out[k] = -(shape[X] * by_x[k] + shape[Y] * by_y[k])

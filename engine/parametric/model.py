@@ -155,7 +155,12 @@ class ImageModel:
         amplitudes, _, _ = self.amplitudes(values)
         lens, host = values[space.lens_slice], values[space.host_slice]
         lit: list[tuple[SersicProfile, PowerLawLens | None, float, FloatArray]] = [
-            (profile_of(host), lens_of(lens), float(amplitudes[HOST_FLUX]), self._host(*lens.tolist(), *host.tolist())[0])
+            (
+                profile_of(host),
+                lens_of(lens),
+                float(amplitudes[HOST_FLUX]),
+                self._host(*lens.tolist(), *host.tolist())[0],
+            )
         ]
         if space.deflector:
             shape = values[space.deflector_slice]
