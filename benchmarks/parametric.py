@@ -26,8 +26,8 @@ SCENES = (("HE0435", 2.0), ("HE0435", 4.0), ("HE1104", 4.0), ("RXJ1131", 2.0), (
 def measured(system: str, n: float) -> dict[str, Any]:
     """CPU seconds of the second fit of a scene, and what it found."""
     # The engine is the one that this process was pointed at.
-    from engine import Host, Realization, simulate_realization  # noqa: PLC0415
-    from engine.parametric.fit import fit_parametric  # noqa: PLC0415
+    from engine import Host, Realization, simulate_realization
+    from engine.parametric.fit import fit_parametric
 
     host = Host(n=n, r_eff=0.39, magnitude=20.5)
     simulation = simulate_realization(Realization(system=system, l_eta=1.0, host=host))

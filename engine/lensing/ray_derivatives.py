@@ -1,8 +1,8 @@
 """Derivatives of where rays meet the source plane by the parameters of the lens, analytically.
 
 With the notation of :mod:`engine.lensing.power_law` the deflection is alpha = e^{i phi} A,
-A = K R^{1-t} e^{i phi'} S(w; f, t), K = 2 b^t / (1 + q), w = e^{2 i phi'}. Its derivatives need two more series beside S:
-those with the coefficients k a_k / f, which turn S by f and by phi', and d a_k / dt.
+A = K R^{1-t} e^{i phi'} S(w; f, t), K = 2 b^t / (1 + q), w = e^{2 i phi'}. Its derivatives need two more series beside
+S: that with the coefficients k a_k / f, which is dS/df and gives dS/dphi', and that with d a_k / dt.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ _LEAST_RADIUS = 1e-3
 class RayConstants(NamedTuple):
     """A lens as :func:`ray_derivatives` takes it: as in :class:`~engine.lensing.power_law.LensConstants`, and more.
 
-    ``by_t`` and ``by_theta`` are d ln K by t, without ln b, and by theta_E; ``front_by_f`` is d ln K / df and ``q_by_f``
-    dq/df; (``cos2``, ``sin2``) are those of 2 phi; ``series`` (3, k) are the coefficients of S, dS/df and dS/dt.
+    ``front`` is 2 b / (1 + q), ``by_theta`` and ``front_by_f`` are d ln K by theta_E and by f, ``q_by_f`` is dq/df;
+    (``cos2``, ``sin2``) are those of 2 phi; ``series`` (3, k) are the coefficients of S, dS/df and dS/dt, the highest
+    power first.
     """
 
     b: float

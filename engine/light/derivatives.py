@@ -51,7 +51,7 @@ def _shape_derivatives(
 def _lens_derivatives(
     x: float, y: float, by_x: FloatArray, by_y: FloatArray, shape: FloatArray, out: FloatArray
 ) -> None:
-    """Derivatives by the lens, with shear or without, at the image position (x, y): of where its ray meets the shape."""
+    """Derivatives by the lens, with shear or without, at an image position, from those by the shape's centre."""
     for k in range(LENS_DERIVATIVES):
         out[k] = -(shape[X] * by_x[k] + shape[Y] * by_y[k])
     if out.size > LENS_DERIVATIVES:
@@ -117,7 +117,7 @@ def _sum_over_cells(
     owner: NDArray[np.int64],
     out: FloatArray,
 ) -> None:
-    """Add integrals over cells, of derivatives at their nodes (k, 9 n), to those (k, pixels) of their ``owner`` (n,)."""
+    """Add integrals over n cells, of derivatives at their nodes (k, 9 n), to their pixels' in ``out`` (k, pixels)."""
     for m in range(values.shape[0]):
         for i in range(owner.size):
             total = 0.0
@@ -129,8 +129,8 @@ def _sum_over_cells(
 class LightDerivatives:
     """Derivatives of a profile's light, behind a lens or not, by :data:`engine.light.sersic.SHAPE` and the lens.
 
-    With a lens those by theta_E, e1, e2, slope, x, y, and gamma1 and gamma2 where ``shear`` is wanted, come first. Light
-    is that of unit flux.
+    With a lens those by theta_E, e1, e2, slope, x and y come first, then, with ``shear``, those by gamma1 and gamma2.
+    Light is that of unit flux.
     """
 
     def __init__(self, profile: SersicProfile, lens: PowerLawLens | None, *, shear: bool = True) -> None:

@@ -119,6 +119,7 @@ def _sum_below(error: FloatArray, limit: float) -> float:
 
 
 def axis_with_halo(centres: FloatArray, side: float, name: str) -> FloatArray:
+    """Centres of pixels with :data:`HALO` more on each side; a SpecError where they are not ``side`` apart."""
     step = math.copysign(side, centres[-1] - centres[0])
     if not np.allclose(np.diff(centres), step, rtol=0.0, atol=1e-6 * side):
         raise SpecError(name, centres, f"centres that are pixel_scale = {side} apart")

@@ -149,7 +149,7 @@ class ImageModel:
         """The model of data less what its columns of deflector and host lack of their exact images.
 
         A fit of the columns to these data is one with exact columns, as far as their error does not change with the
-        parameters (defect correction): ``values`` should lie near the solution.
+        parameters (defect correction): ``values`` should lie near the solution. AGN images begin exactly there.
         """
         space = self.space
         amplitudes, _, _ = self.amplitudes(values)
@@ -159,7 +159,7 @@ class ImageModel:
                 profile_of(host),
                 lens_of(lens),
                 float(amplitudes[HOST_FLUX]),
-                self._host(*lens.tolist(), *host.tolist())[0],
+                self._host(*values[space.lens_slice.start :].tolist())[0],
             )
         ]
         if space.deflector:
@@ -206,7 +206,10 @@ class ImageModel:
         return np.concatenate([self.amplitudes(values)[1], constraints(self.space, values, self.priors)])
 
     def jacobian(self, values: FloatArray) -> FloatArray:
-        """Derivatives of :meth:`residuals`, of the integrals of the light where these are ``exact``, else of samples."""
+        """Derivatives of :meth:`residuals`: of integrals of the light where the model is ``exact``, else of samples.
+
+        At values whose light has been rendered nothing is rendered again.
+        """
         best, _, columns = self.amplitudes(values)
         moved = self._column_derivatives(values, best)
         basis, _ = np.linalg.qr(columns)
