@@ -223,7 +223,7 @@ def under_way(port: int) -> float:
 
 def read_streams(port: int, grid: str, streams: int) -> None:
     """Hold streams open until the end of this process."""
-    request = f"GET /v1/grids/{grid}/events HTTP/1.1\r\nHost: a\r\nAccept: text/event-stream\r\n\r\n".encode()
+    request = f"GET /v1/grids/{grid}/events HTTP/1.1\r\nHost: localhost\r\nAccept: text/event-stream\r\n\r\n".encode()
     with selectors.DefaultSelector() as ready:
         for _ in range(streams):
             connection = Connection(port, request)
@@ -240,7 +240,7 @@ def probe(port: int, seconds: float) -> list[float]:
     until = time.perf_counter() + seconds
     while time.perf_counter() < until:
         began = time.perf_counter()
-        connection = Connection(port, b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n")
+        connection = Connection(port, b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
         connection.ask()
         while not connection.read():
             pass

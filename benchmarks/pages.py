@@ -32,7 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         upgrade(url)
         database = Database(url)
         fill(database, options.results)
-        with TestClient(create_app(Settings(database_url=url, data_dir=Path(folder)))) as client:
+        with TestClient(
+            create_app(Settings(database_url=url, data_dir=Path(folder))), base_url="http://localhost"
+        ) as client:
             grid = client.get("/v1/grids").json()["items"][0]["id"]
             run = client.get(f"/v1/grids/{grid}/runs", params={"limit": 1}).json()["items"][0]["id"]
             pages = {

@@ -200,7 +200,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(
             f"{options.results} results written in {time.perf_counter() - began:.0f} s; load {os.getloadavg()[0]:.1f}"
         )
-        with TestClient(create_app(Settings(database_url=url, data_dir=Path(folder)))) as client:
+        with TestClient(
+            create_app(Settings(database_url=url, data_dir=Path(folder))), base_url="http://localhost"
+        ) as client:
             check(database, client.get("/v1/summary", params={"group_by": "system"}).json())
             print(f"{'':42s} first   best wall   best CPU of this process [ms]")
             for name, query in ASKED.items():

@@ -26,7 +26,7 @@ class ApiError(ClientError):
 
     def __init__(self, status: int, problem: dict[str, Any]) -> None:
         # The places say what the detail says as a whole.
-        places = [f"{place.get('pointer') or place.get('in')}: {place.get('message')}" for place in _places(problem)]
+        places = map(_told, _places(problem))
         super().__init__("; ".join(places) or str(problem.get("detail") or problem.get("title") or f"status {status}"))
         self.status = status
         self.problem = problem
@@ -137,6 +137,13 @@ def _problem(answer: httpx.Response) -> dict[str, Any]:
     except (ValueError, RecursionError):
         return plain
     return said if isinstance(said, dict) else plain
+
+
+def _told(place: dict[str, Any]) -> str:
+    """Where something is wrong and what, without the place where the message begins with it anyway."""
+    where, message = str(place.get("pointer") or place.get("in")), str(place.get("message"))
+    field = re.escape(where.strip("/").partition("/")[0])
+    return message if re.match(rf"{field}(\W\S*)?: ", message) else f"{where}: {message}"
 
 
 def _places(problem: dict[str, Any]) -> list[dict[str, Any]]:

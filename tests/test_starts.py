@@ -11,7 +11,8 @@ from benchmarks.starts import land, paper_runs
         # Four times the largest errors of the whole benchmark for that system and magnitude.
         ("WFI2033", 1.2, 4.0, (2e-3, 0.02, 0.05, 0.1)),
         ("HE1104", 0.8, 2.0, (2e-3, 0.02, 0.05, 0.1)),
-        ("HS2209", 1.0, 2.0, (4e-3, 0.05, 0.2, 0.2)),
+        # That a fit lands there too is seen in tests/hard_cases/test_hosts.py, in a smaller field.
+        pytest.param("HS2209", 1.0, 2.0, (4e-3, 0.05, 0.2, 0.2), marks=pytest.mark.long),
     ],
 )
 def test_the_start_lands_beside_the_truth(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
-from engine.likelihood.w_tilde import curvature_matrix, workspace
+from engine.likelihood.w_tilde import curvature_matrices, curvature_matrix, together, workspace
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, map_rays
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant
@@ -111,11 +112,11 @@ def _solve(
 
 
 def _map_and_curve(
-    likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel, memory: FloatArray | None = None
+    likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel
 ) -> tuple[LensingMatrix, FloatArray]:
-    """L and F, which lies in ``memory`` where that is given."""
+    """L and F."""
     lensing = map_rays(likelihood.rays, lens, model.shape)
-    return lensing, curvature_matrix(likelihood.w_tilde, likelihood.border, lensing, memory)
+    return lensing, curvature_matrix(likelihood.w_tilde, likelihood.border, lensing)
 
 
 def normal_equations(
@@ -139,14 +140,50 @@ def _ln_evidence(likelihood: MarginalLikelihood, model: SourceModel, ln_lambda: 
     )
 
 
+def ln_evidences(
+    likelihood: MarginalLikelihood, lenses: Sequence[PowerLawLens], ln_lambdas: Sequence[float], model: SourceModel
+) -> list[float | InversionError]:
+    """Ln Z of the data given each lens and its ln lambda; where it cannot be had the error that says why.
+
+    As many as fit the cache share what it costs to fetch W from memory (:func:`~.w_tilde.together`).
+    """
+    n = model.shape[0] * model.shape[1]
+    found: list[float | InversionError] = []
+    size = together(n)
+    for begin in range(0, len(lenses), size):
+        mapped = [_mapped(likelihood, lens, model) for lens in lenses[begin : begin + size]]
+        lensings = [each for each in mapped if isinstance(each, LensingMatrix)]
+        memory = [workspace.array(f"A{k}", (n, n)) for k in range(len(lensings))]
+        curved = iter(curvature_matrices(likelihood.w_tilde, likelihood.border, lensings, memory))
+        for each, ln_lambda in zip(mapped, ln_lambdas[begin : begin + size], strict=True):
+            if isinstance(each, InversionError):
+                found.append(each)
+                continue
+            try:
+                solved = _solve(likelihood, each, next(curved), ln_lambda, model)
+                found.append(_ln_evidence(likelihood, model, ln_lambda, solved))
+            except InversionError as error:
+                found.append(error)
+    return found
+
+
+def _mapped(likelihood: MarginalLikelihood, lens: PowerLawLens, model: SourceModel) -> LensingMatrix | InversionError:
+    """L of a lens, or why there is none."""
+    try:
+        return map_rays(likelihood.rays, lens, model.shape)
+    except InversionError as error:
+        return error
+
+
 def ln_evidence(likelihood: MarginalLikelihood, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> float:
     """Ln Z of the data given lens and ln lambda.
 
     An InversionError says what to change where A is not positive definite.
     """
-    n = model.shape[0] * model.shape[1]
-    lensing, f = _map_and_curve(likelihood, lens, model, workspace.array("A", (n, n)))
-    return _ln_evidence(likelihood, model, ln_lambda, _solve(likelihood, lensing, f, ln_lambda, model))
+    found = ln_evidences(likelihood, [lens], [ln_lambda], model)[0]
+    if isinstance(found, InversionError):
+        raise found
+    return found
 
 
 def invert(likelihood: MarginalLikelihood, lens: PowerLawLens, ln_lambda: float, model: SourceModel) -> Inversion:

@@ -24,10 +24,10 @@ from engine.result import ChainStatus, ChainSummary
 
 _SURROGATE_SHARE = 0.9
 """The remaining differential evolution is for what no surrogate has learnt."""
-_BURN_IN_STEPS = 5
+_BURN_IN_STEPS = 3
 _RESTARTS, _RESTART_STEPS, _USUAL_TAU = 2, 60, 2.0
 """How often, and after how many steps, a chain may be restarted with a surrogate that has learnt from it; tau then."""
-_CHUNK = 15
+_CHUNK = 5
 _WINDOW = 5
 AUTOCORRELATION_TIMES = 50.0
 """Least length of a chain that is called converged, in autocorrelation times (emcee's own rule)."""
@@ -138,7 +138,7 @@ def _on_surrogate(
     moves = [(emcee.moves.MHMove(surrogate), _SURROGATE_SHARE)]
     if walkers >= 2 * laplace.mean.size:
         moves.append((emcee.moves.DEMove(), 1.0 - _SURROGATE_SHARE))
-    sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, known, moves=moves)
+    sampler = emcee.EnsembleSampler(walkers, laplace.mean.size, known.many, moves=moves, vectorize=True)
     state = emcee.State(surrogate.draw(walkers, random), random_state=random.get_state())
     state = sampler.run_mcmc(state, _BURN_IN_STEPS, skip_initial_state_check=True)
     sampler.reset()

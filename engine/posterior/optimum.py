@@ -56,17 +56,15 @@ def _quadratic_model(
 ) -> tuple[FloatArray, FloatArray]:
     """Gradient and Hessian of the target in the coordinates z of centre + root z, from steps of one."""
     d = centre.size
-    forward = np.array([target(centre + root[:, i]) for i in range(d)])
-    backward = np.array([target(centre - root[:, i]) for i in range(d)])
+    forward, backward = np.split(target.many(np.vstack([centre + root.T, centre - root.T])), 2)
     usable = np.isfinite(forward) & np.isfinite(backward)
     gradient = np.where(usable, 0.5 * (forward - backward), 0.0)
     hessian = np.diag(np.where(usable, forward - 2.0 * value + backward, -1.0))
-    for i in range(d):
-        for j in range(i):
-            if usable[i] and usable[j]:
-                both = target(centre + root[:, i] + root[:, j])
-                if math.isfinite(both):
-                    hessian[i, j] = hessian[j, i] = both - forward[i] - forward[j] + value
+    pairs = [(i, j) for i in range(d) for j in range(i) if usable[i] and usable[j]]
+    both = target.many(np.array([centre + root[:, i] + root[:, j] for i, j in pairs]).reshape(-1, d))
+    for (i, j), found in zip(pairs, both, strict=True):
+        if math.isfinite(found):
+            hessian[i, j] = hessian[j, i] = found - forward[i] - forward[j] + value
     return gradient, hessian
 
 

@@ -1,8 +1,8 @@
 """A surrogate of the target, learnt from evaluations of it, and the move of a chain that walks on it.
 
-The surrogate is the Student density of the Gaussian approximation times the exponential of a Gaussian process through
-what ln of the target differs from it by: it follows a posterior that bends, and far from all that is known it is the
-Student density. A walk on it costs next to nothing. Where a walk ends is a proposal that the target then accepts with
+The surrogate is the Gaussian approximation, with tails that fall more slowly, times the exponential of a Gaussian
+process through what ln of the target differs from it by: it follows a posterior that bends, and far from all that is
+known it is the approximation. A walk on it costs next to nothing. Where it ends is a proposal, accepted with
 probability min(1, pi(y) s(x) / (pi(x) s(y))) (delayed acceptance: Christen & Fox 2005): each step of the walk is
 reversible with regard to the surrogate s, which may be a warmer one, and so is the walk. That leaves the target pi
 invariant however wrong the surrogate is; a wrong one costs acceptance.
@@ -33,14 +33,26 @@ _TEMPERATURE = 2.0
 """The places that are learnt from are drawn from the surrogate at this temperature: tails are where walkers stick."""
 _WARMTH = 1.15
 """The temperature at which the chain walks: with tails no lighter than the target's no walker sticks in them."""
-_BATCH, _MAX_ROUNDS = 60, 6
+_CORE = 4.0
+"""Deviations beyond which the approximation falls as an exponential: no walk is to get lost where nothing is known."""
+_FIRST = 60
+_BATCHES = (30, 30, 60, 60, 60, 60, 60)
+"""Evaluations of the rounds of lessons: few where the approximation is good, and as many as ever where it is not."""
+_ENOUGH = 10
+"""Places near the maximum that tell how large the error is."""
 _MOST_KNOWN = 800
 """The latest evaluations that are learnt from: the process costs the cube of their number."""
-_GOOD = 0.2
+_GOOD = 0.3
 """Error of ln of the target (rms, near its maximum) at which the surrogate has learnt enough."""
 _POPULATION, _LONG_WALK, _WALK = 200, 100, 40
 _RANDOM_WALK, _STRETCH = 0.7, 0.5
 """Length of random-walk steps in deviations, and the scatter of its logarithm."""
+
+
+def ln_core(z2: FloatArray) -> FloatArray:
+    """Ln (n,) of what takes the place of the standard normal at squared distances (n,): slower tails, zero at z = 0."""
+    z = np.sqrt(z2)
+    return np.where(z < _CORE, -0.5 * z2, _CORE * (0.5 * _CORE - z))
 
 
 class Surrogate:
@@ -54,11 +66,12 @@ class Surrogate:
     ) -> None:
         self.prior, self.proposal = prior, StudentProposal(mean, covariance)
         top = float(values.max())
-        differs = np.maximum(values, top - _DEPTH) - self.proposal.ln_density(points)
+        z = self.proposal.whiten(points)
+        differs = np.maximum(values, top - _DEPTH) - ln_core((z**2).sum(axis=1))
         # The process goes back to zero: where nothing is known the surrogate should be as high as it is elsewhere.
         self._level = float(np.median(differs[values > top - 0.5 * _DEPTH]))
         self._process = RBFInterpolator(
-            self.proposal.whiten(points),
+            z,
             differs - self._level,
             kernel="gaussian",
             epsilon=1.0 / (math.sqrt(2.0) * _LENGTH),
@@ -68,7 +81,8 @@ class Surrogate:
 
     def ln_density(self, states: FloatArray) -> FloatArray:
         """What it takes ln of the target (n,) to be at states (n, d); minus infinity outside the prior."""
-        found = self._level + self.proposal.ln_density(states) + self._process(self.proposal.whiten(states))
+        z = self.proposal.whiten(states)
+        found = self._level + ln_core((z**2).sum(axis=1)) + self._process(z)
         return np.where(self._inside(states), found, -np.inf)
 
     def _inside(self, states: FloatArray) -> NDArray[np.bool_]:
@@ -137,20 +151,19 @@ def learn_surrogate(known: Recorded, prior: Prior, laplace: Laplace, random: np.
         The Gaussian approximation lies where the target is nothing.
     """
     if len(known.values) < laplace.mean.size:
-        for place in StudentProposal(laplace.mean, _TEMPERATURE * laplace.covariance).draw(_BATCH, random):
-            known(place)
+        known.many(StudentProposal(laplace.mean, _TEMPERATURE * laplace.covariance).draw(_FIRST, random))
     if not known.values:
         raise PosteriorError("chain: the target is nothing anywhere that the Gaussian approximation proposes")
     surrogate, population = fit_surrogate(known, prior, laplace.mean, laplace.covariance, random)
-    for _ in range(_MAX_ROUNDS):
-        places, expected, _ = surrogate.walk(population[:_BATCH], _WALK, random, _TEMPERATURE)
+    for batch in _BATCHES:
+        places, expected, _ = surrogate.walk(population[:batch], _WALK, random, _TEMPERATURE)
         top = max(known.values)
-        found = np.array([known(place) for place in places])
+        found = known.many(places)
         near = found > top - 0.5 * places.shape[1] - 4.0
         error = (found - expected)[near]
         surrogate, population = fit_surrogate(
             known, prior, surrogate.proposal.mean, surrogate.proposal.root @ surrogate.proposal.root.T, random
         )
-        if near.any() and float(error.std()) < _GOOD:
+        if error.size >= _ENOUGH and float(error.std()) < _GOOD:
             break
     return surrogate

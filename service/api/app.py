@@ -101,7 +101,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.state.context = context
     app.add_middleware(BodyLimit, max_bytes=context.settings.max_body_bytes, streamed=frozenset({measurements.ADDRESS}))
     # Before the body is read: who may not come in sends none.
-    app.add_middleware(Gate, tokens=context.tokens if context.settings.asks_for_tokens else None)
+    asked = context.tokens if context.settings.asks_for_tokens else None
+    app.add_middleware(Gate, tokens=asked, hosts=context.settings.hosts)
     app.add_middleware(Head)
     # Last added is outermost: refused bodies are requests too.
     app.add_middleware(Measured, metrics=context.metrics)

@@ -11,7 +11,7 @@ from service import VERSION
 from service.api.links import link_system
 from service.domain.requests import engine_view, list_cameras, list_systems, system_view
 from service.domain.views import CameraList, EngineView, SystemList, SystemView
-from service.store.grids import NotFoundError
+from service.store.runs import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["catalogue"])
 # Its handlers are no threads' work: what they give was read with the engine.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import astuple, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from fastapi import APIRouter, FastAPI, Header, Path, Query, Request, Response
 from pydantic import Field
@@ -16,18 +16,16 @@ from service.api.problems import InvalidRequestError, problem
 from service.api.results import FilterBody, read_filter
 from service.api.threads import Route, patient
 from service.domain.payload import RECOMMENDED, estimator_and_prior
-from service.figures.drawing import draw
-from service.figures.montage import montage
-from service.figures.question import FIGURE_KINDS, FigureKind, FigureQuestion, OfPoints, Prior
+from service.figures.apart import DrawingProcess
+from service.figures.drawing import drawn
+from service.figures.montage import montage, read_arrays
+from service.figures.question import FIGURE_KINDS, FigureFormat, FigureKind, FigureQuestion, OfPoints, Prior
 from service.store.bias_rows import TooManyPointsError, bias_points, content, montage_runs
-from service.store.grids import NotFoundError
 from service.store.result_filter import ResultFilter
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from service.store.runs import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["figures"], route_class=Route)
-FigureFormat = Literal["svg", "png"]
+_DRAWING = DrawingProcess()
 _ESTIMATOR, _PRIOR = estimator_and_prior(RECOMMENDED)
 _MEDIA: dict[str, str] = {"svg": "image/svg+xml", "png": "image/png"}
 _MOST_POINTS = 50_000
@@ -96,9 +94,7 @@ def of_grid(
         raise InvalidRequestError("query", "grid", "grid: the address names one already")
     grid = service.grids.grid(grid_id)
     where = read_filter(query.model_copy(update={"grid": [grid_id]}))
-    return _answer(
-        service, _Wanted(_question(figure, query), where, grid.name or grid.id, kind, grid_id), if_none_match
-    )
+    return _answer(service, _Wanted(_question(figure, query), where, grid.name or "", kind, grid_id), if_none_match)
 
 
 def install(app: FastAPI) -> None:
@@ -134,21 +130,16 @@ def _answer(service: Context, wanted: _Wanted, if_none_match: str | None) -> Res
 
 
 def _drawn(service: Context, wanted: _Wanted) -> bytes:
-    from engine.figures import figure_bytes  # noqa: PLC0415 - matplotlib takes a second
-
-    return figure_bytes(_figure(service, wanted), wanted.kind)
-
-
-def _figure(service: Context, wanted: _Wanted) -> Figure:
     question = wanted.question
     if question.kind == "montage":
         if wanted.grid_id is None:
             raise NotFoundError("a montage is of one grid")
         with service.database.read() as connection:
             runs = montage_runs(connection, wanted.where, question.estimator, question.free, _MOST_THUMBNAILS)
-        return montage(runs, service.artefacts, wanted.heading, question.columns)
+        arrays = read_arrays(runs, service.artefacts)
+        return _DRAWING.call(montage, runs, arrays, wanted.heading, question.columns, wanted.kind)
     with service.database.read() as connection:
         points = bias_points(
             connection, wanted.where, question.estimator, question.priors, question.quantities, _MOST_POINTS
         )
-    return draw(question, points, wanted.heading)
+    return _DRAWING.call(drawn, question, points, wanted.heading, wanted.kind)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ipaddress
+from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import Annotated
 from urllib.parse import quote, urlsplit
@@ -33,13 +35,16 @@ class Gate:
     """Answers 401 to whom no token lets in and 403 to whom it does not let so far; asks nobody without ``tokens``.
 
     A token comes in the header Authorization, or from a browser in a cookie. A browser sends its cookies, and reaches a
-    service that asks for no token, on behalf of whatever page it shows: what changes anything is only taken from
-    pages of this service.
+    service that asks for no token, on behalf of whatever page it shows: what changes anything is only taken from pages
+    of this service. Where ``hosts`` are given, a request has to call the service by one of them, a name of loopback or
+    one without a dot, else it is 421: another site's name may be made to lead here (DNS rebinding), and its pages would
+    be taken for ours.
     """
 
-    def __init__(self, app: ASGIApp, tokens: TokenStore | None) -> None:
+    def __init__(self, app: ASGIApp, tokens: TokenStore | None, hosts: frozenset[str] | None = None) -> None:
         self.app = app
         self._tokens = tokens
+        self._hosts = hosts
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request."""
@@ -63,6 +68,10 @@ class Gate:
 
     async def _refusal(self, request: Request) -> Response | None:
         """The answer that ends it here, or None, with who asks on the request."""
+        called = request.headers.get("host")
+        if self._hosts is not None and called is not None and not _is_called(called, self._hosts):
+            detail = f"the service is not called {called[:100]}; HOSTLENS_ALLOWED_HOSTS says what it is called"
+            return problem(request, HTTPStatus.MISDIRECTED_REQUEST, detail)
         given, is_ambient = _given(request)
         if request.method not in _SAFE and is_ambient and not _is_own(request.headers):
             return problem(request, 403, "the request comes from a page of another site")
@@ -97,6 +106,20 @@ def _cookie(headers: Headers) -> str | None:
     except CookieError:
         return None
     return cookies[COOKIE].value if COOKIE in cookies else None
+
+
+def _is_called(called: str, hosts: frozenset[str]) -> bool:
+    """Whether the header Host names one of the hosts, or what nobody elsewhere can make lead here.
+
+    That is loopback, and any name without a dot: it is of this machine or its network, never of somebody's site.
+    """
+    try:
+        name = urlsplit(f"//{called}").hostname or ""
+        if name in hosts or name.endswith(".localhost") or not {".", ":"} & set(name):
+            return True
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
 
 
 def _is_own(headers: Headers) -> bool:

@@ -38,7 +38,7 @@ from service.domain.views import (
     RunPage,
     Summary,
 )
-from service.store.grids import NotFoundError
+from service.store.runs import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
 _LOG = logging.getLogger(__name__)

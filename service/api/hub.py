@@ -20,8 +20,8 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from service.api.threads import EVENTS, run_in
 from service.domain.views import EventPage, EventView
 from service.store.database import AWAY
-from service.store.grids import NotFoundError
 from service.store.outbox import EventStore
+from service.store.runs import NotFoundError
 
 T = TypeVar("T")
 _LOG = logging.getLogger(__name__)

@@ -32,7 +32,7 @@ from service.domain.measurements import (
 )
 from service.domain.views import MeasurementPage, MeasurementView
 from service.store.artefacts import ArtefactStore
-from service.store.grids import NotFoundError
+from service.store.runs import NotFoundError
 
 ADDRESS = "/v1/measurements"
 router = APIRouter(prefix="/v1", tags=["measurements"], route_class=Route)
@@ -43,7 +43,7 @@ _MAX_FIELD_BYTES = 10_000
 _CARD, _BLOCK = 80, 2880
 _MAX_HEADER_BYTES = 2**21
 _AT_ONCE = asyncio.Semaphore(2)
-"""Files that a process has in memory at a time, on their way to the artefact store."""
+"""Files that a process sends to the artefact store at a time: a bucket's driver has them in memory meanwhile."""
 _FILE = {"type": "string", "format": "binary"}
 _OPTIONS = MeasurementOptions.model_json_schema()["properties"] | {
     "positions": {"type": "array", "items": {"type": "string"}, "description": "x,y of an AGN image, once for each"}
@@ -202,5 +202,4 @@ def _header(name: str, upload: UploadFile) -> set[str]:
 
 
 def _put(store: ArtefactStore, upload: UploadFile) -> str:
-    upload.file.seek(0)
-    return store.put(upload.file.read(), "fits").key
+    return store.put_file(upload.file, "fits").key

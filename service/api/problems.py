@@ -22,7 +22,8 @@ from service.domain.requests import TooManyRunsError
 from service.domain.views import Place, Problem
 from service.store.database import AWAY
 from service.store.faults import AccessRefusedError, SchemaMismatchError, StatementTooLongError
-from service.store.grids import KeyReusedError, NotFoundError
+from service.store.grids import KeyReusedError
+from service.store.runs import NotFoundError
 from service.store.submission import SubmissionLostError
 from service.web.rendering import page, wants_page
 

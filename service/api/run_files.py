@@ -15,7 +15,7 @@ from service.domain.views import RunRecord
 from service.exports.products import NoChainError, NoProductsError, chain_file, fits_file, provenance, read_products
 from service.exports.record import read_found, record
 from service.store.artefacts import ArtefactDamagedError
-from service.store.grids import NotFoundError
+from service.store.runs import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=Route)
 IfNoneMatch = Annotated[str | None, Header()]

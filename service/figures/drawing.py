@@ -6,10 +6,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from engine import TRENDS, BiasPoint, coverage_curve, group_points, pull_summary, trend_series
-from service.figures.question import FigureQuestion
+from service.figures.question import FigureFormat, FigureQuestion
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def drawn(question: FigureQuestion, points: Sequence[BiasPoint], heading: str, kind: FigureFormat) -> bytes:
+    """The figure of some points as a file; errors as :func:`draw`."""
+    from engine.figures import figure_bytes  # noqa: PLC0415 - matplotlib takes a second
+
+    return figure_bytes(draw(question, points, heading), kind)
 
 
 def draw(question: FigureQuestion, points: Sequence[BiasPoint], heading: str) -> Figure:

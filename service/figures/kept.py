@@ -11,8 +11,8 @@ from service.runtime.kept import KeptBytes
 class KeptFigures:
     """Bytes of figures by what they were drawn from.
 
-    Only one is drawn at a time: matplotlib holds the interpreter, and whoever asks for something else meanwhile is to
-    find it half free. Who asks for a figure that is being drawn waits for it, and it is not drawn again.
+    Only one is drawn at a time, by one process: figures that many ask for at once are not to take the cores of the
+    workers. Who asks for a figure that is being drawn waits for it, and it is not drawn again.
     """
 
     def __init__(self, room_bytes: int) -> None:

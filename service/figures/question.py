@@ -10,6 +10,7 @@ from engine import Grouping, HostQuantity
 FigureKind = Literal["bias", "sample", "coverage", "pull", "trends", "montage"]
 FIGURE_KINDS: tuple[FigureKind, ...] = get_args(FigureKind)
 OfPoints = Literal["bias", "sample", "coverage", "pull", "trends"]
+FigureFormat = Literal["svg", "png"]
 Prior = Literal["wide", "free", "fixed"]
 
 

@@ -23,7 +23,7 @@ def _json_list(value: Any) -> Any:
     try:
         return json.loads(value)
     except (ValueError, RecursionError):
-        raise ValueError('allowed is a JSON list, as ["--mem=4G"]') from None
+        raise ValueError('allowed is a JSON list of texts, as ["a", "b"]') from None
 
 
 def _home(path: Path) -> Path:
@@ -112,6 +112,7 @@ Memory = Annotated[str, AfterValidator(_memory)]
 Host = Annotated[str, AfterValidator(_host)]
 DaskAddress = Annotated[str, AfterValidator(_dask_address)]
 Lines = Annotated[list[str], NoDecode, BeforeValidator(_json_list)]
+Hosts = Annotated[list[Host], NoDecode, BeforeValidator(_json_list)]
 ClusterKind = Literal["local", "address", "slurm", "kubernetes"]
 LogLevel = Annotated[
     Literal["DEBUG", "INFO", "WARNING", "ERROR"],

@@ -19,6 +19,7 @@ from service.runtime.setting_types import (
     DatabaseUrl,
     Home,
     Host,
+    Hosts,
     KubernetesMemory,
     Lines,
     LogLevel,
@@ -78,6 +79,9 @@ class Settings(LogSettings):
     auth: Literal["off", "tokens"] | None = None
     """Whether the API asks for tokens; where None, unless it listens on loopback. ``off`` elsewhere is for a proxy or a
     firewall that asks who comes; ``tokens`` on loopback for a proxy that does not."""
+    allowed_hosts: Hosts = Field(default_factory=list)
+    """Names that requests may call the API by beside those of loopback and those without a dot, as a JSON list. Without
+    any, requests to a service that asks nobody on loopback have to call it by those, and to any other as they like."""
     max_body_bytes: Annotated[int, Field(ge=1024, le=2**30)] = 1_000_000
     max_upload_bytes: Annotated[int, Field(ge=10_000, le=2**33)] = 64_000_000
     """Of the files of a measurement together."""
@@ -179,6 +183,12 @@ class Settings(LogSettings):
     def asks_for_tokens(self) -> bool:
         """Whether the API lets in only who brings a token."""
         return (self.auth or ("off" if self.host in LOOPBACK else "tokens")) == "tokens"
+
+    @property
+    def hosts(self) -> frozenset[str] | None:
+        """Names that the API is called by beside those of loopback; any will do where None."""
+        is_open = not self.asks_for_tokens and self.host in LOOPBACK
+        return frozenset(map(str.lower, self.allowed_hosts)) if is_open or self.allowed_hosts else None
 
     @property
     def url(self) -> str:

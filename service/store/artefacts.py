@@ -12,13 +12,13 @@ import hashlib
 import os
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 from uuid import uuid4
 
 import fsspec
@@ -31,6 +31,7 @@ _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 _PATIENCE_S = 30.0
 _HANGING = 4
 """Calls of a store, each for another file, that may hang in a process before the next are not even begun."""
+_PIECE = 2**20
 _PROBE = ".probe"
 _WHOLE = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss"})
 """Protocols where an object appears as a whole or not at all; to move one there is to copy it."""
@@ -90,17 +91,24 @@ class ArtefactStore:
 
     def put(self, data: bytes, suffix: str) -> ArtefactPayload:
         """Write ``data``, or renew its time where it is there; ArtefactStoreError where the store does not take it."""
-        digest = hashlib.sha256(data).hexdigest()
-        key = f"{digest[:2]}/{digest}.{suffix}"
-        _check(key)
+        made = _artefact(hashlib.sha256(data).hexdigest(), suffix)
         try:
-            self._call(key, lambda place: place.put(key, data))
+            self._call(made.key, lambda place: place.put(made.key, [data]))
         except ArtefactStoreError:
             kept = _kept.get()
             if kept is None:
                 raise
-            kept[key] = data
-        return ArtefactPayload(key=key, digest=digest)
+            kept[made.key] = data
+        return made
+
+    def put_file(self, file: BinaryIO, suffix: str) -> ArtefactPayload:
+        """The same with what a file holds, from its beginning; a folder takes it piece by piece, a bucket at once."""
+        digest = hashlib.sha256()
+        for piece in _pieces(file):
+            digest.update(piece)
+        made = _artefact(digest.hexdigest(), suffix)
+        self._call(made.key, lambda place: place.put(made.key, _pieces(file)))
+        return made
 
     def read(self, key: str) -> bytes:
         """The bytes under ``key``.
@@ -183,10 +191,10 @@ class _Place:
     def path(self, key: str) -> str:
         return f"{self._root}/{key}"
 
-    def put(self, key: str, data: bytes) -> None:
+    def put(self, key: str, pieces: Iterable[bytes]) -> None:
         path = self.path(key)
-        if not (self._is_local and _renew(Path(path), data)):
-            self._write(path, data)
+        if not (self._is_local and _renew(Path(path), _check(key)["digest"])):
+            self._write(path, pieces)
 
     def read(self, key: str) -> bytes | None:
         """What lies there, b"" for what is no file; None where nothing lies there and the store is not away itself."""
@@ -203,7 +211,7 @@ class _Place:
 
     def probe(self) -> None:
         path = f"{self._root}/{_PROBE}"
-        self._write(path, b"hostlens")
+        self._write(path, [b"hostlens"])
         # Where nothing may be removed it is written over the next time.
         with suppress(OSError):
             self._files.rm_file(path)
@@ -213,21 +221,21 @@ class _Place:
             return Path(path).read_bytes()
         return bytes(self._files.cat_file(path))
 
-    def _write(self, path: str, data: bytes) -> None:
+    def _write(self, path: str, pieces: Iterable[bytes]) -> None:
         """Let the bytes appear under ``path`` as a whole: a reader, or a second writer, never sees half a file."""
         if self._is_local:
-            _write_file(Path(path), data)
+            _write_file(Path(path), pieces)
         elif self._is_whole:
-            self._files.pipe_file(path, data)
+            self._files.pipe_file(path, b"".join(pieces))
         else:
-            partial = f"{path}.{uuid4().hex}.partial"
+            beside = f"{path}.{uuid4().hex}.partial"
             self._files.makedirs(self._files._parent(path), exist_ok=True)
             try:
-                self._files.pipe_file(partial, data)
-                self._files.mv(partial, path)
+                self._files.pipe_file(beside, b"".join(pieces))
+                self._files.mv(beside, path)
             except Exception:
                 with suppress(Exception):
-                    self._files.rm_file(partial)
+                    self._files.rm_file(beside)
                 raise
 
 
@@ -249,34 +257,45 @@ def _check(key: str) -> re.Match[str]:
     return found
 
 
-def _renew(path: Path, data: bytes) -> bool:
+def _artefact(digest: str, suffix: str) -> ArtefactPayload:
+    key = f"{digest[:2]}/{digest}.{suffix}"
+    _check(key)
+    return ArtefactPayload(key=key, digest=digest)
+
+
+def _pieces(file: BinaryIO) -> Iterator[bytes]:
+    file.seek(0)
+    return iter(partial(file.read, _PIECE), b"")
+
+
+def _renew(path: Path, digest: str) -> bool:
     """Whether the bytes lie there already: they, and not only the name, which a crash or a full disk may have left.
 
     Then only the time is new: by it a file that nothing refers to yet is told from one that nothing refers to any more.
     """
-    with suppress(OSError):
-        if path.read_bytes() == data:
+    with suppress(OSError), path.open("rb") as file:
+        if hashlib.file_digest(file, "sha256").hexdigest() == digest:
             os.utime(path)
             _sync(path.parent)  # whoever wrote it may not have come so far
             return True
     return False
 
 
-def _write_file(path: Path, data: bytes) -> None:
+def _write_file(path: Path, pieces: Iterable[bytes]) -> None:
     """Write a file beside its place, to the disk itself, then move it there; nothing is left where that fails."""
     _make_folder(path.parent)
-    partial = path.with_name(f"{path.name}.{uuid4().hex}.partial")
+    beside = path.with_name(f"{path.name}.{uuid4().hex}.partial")
     try:
-        with partial.open("xb") as file:
-            file.write(data)
+        with beside.open("xb") as file:
+            file.writelines(pieces)
             file.flush()
             os.fsync(file.fileno())
         if path.is_dir():
             path.rename(path.with_name(f"{path.name}.{uuid4().hex}.damaged"))
-        partial.replace(path)
+        beside.replace(path)
     except BaseException:
         with suppress(OSError):
-            partial.unlink(missing_ok=True)
+            beside.unlink(missing_ok=True)
         raise
     _sync(path.parent)
 

@@ -1,4 +1,4 @@
-"""Grids and runs as the API sees them: created, looked at, paused, resumed, cancelled, tried again."""
+"""Grids as the API sees them: created, looked at, paused, resumed, cancelled, tried again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from sqlalchemy import (
     Row,
     bindparam,
     case,
-    false,
     func,
     literal_column,
     select,
@@ -24,35 +23,25 @@ from sqlalchemy import (
 from sqlalchemy.exc import IntegrityError
 
 from service.domain.identifiers import utc_now
-from service.domain.plan import IMAGE, Plan
+from service.domain.plan import Plan
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
-from service.domain.views import CompactRunPage, GridKind, GridPage, GridView, RunDetail, RunPage
+from service.domain.views import GridKind, GridPage, GridView
 from service.store.database import Database
 from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent, recent_of
 from service.store.pieces import PIECE, Turns
 from service.store.rows import (
-    ATTEMPT_COLUMNS,
-    ESTIMATE_COLUMNS,
-    RUN_COLUMNS,
     ended_grid_view,
     grid_view,
-    run_document,
-    run_item,
-    run_view,
 )
 from service.store.run_filter import RunFilter
+from service.store.runs import IS_IMAGE, WHOLE, NotFoundError, RunStore, require_grid
 from service.store.settling import IS_OPEN, revive_runs, settle
 from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
-from service.store.tables import attempt, estimate, event, grid, idempotency, result, run
+from service.store.tables import event, grid, idempotency, run
 
-WHOLE = grid.c.storing == false()
-"""What anybody may see: all but what is being stored."""
-# Spelt out: a database takes a partial index only where it sees that the condition implies it.
-IS_IMAGE = run.c.kind == literal_column(f"'{IMAGE}'")
-"""Whether a run measures an uploaded image."""
 _REOPENED = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
 _BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
 
@@ -72,27 +61,6 @@ _COUNTS = (
     .where(run.c.grid_id.in_(bindparam("ids", expanding=True)))
     .group_by(run.c.grid_id, run.c.state)
 )
-_RUN = select(run).join(grid, grid.c.id == run.c.grid_id).where(run.c.id == bindparam("wanted"), WHOLE)
-_VERSION_OF_RUN = ("state", "attempt", "suspect", "finished_at", "error_code", "error_detail")
-_VERSION_OF_RESULT = ("payload_digest", "stored_at", "figure", "products")
-_RUN_VERSION = (
-    select(
-        *(run.c[name] for name in _VERSION_OF_RUN),
-        # They may be pruned.
-        select(func.count()).where(attempt.c.run_id == run.c.id).correlate(run).scalar_subquery(),
-        *(result.c[name] for name in _VERSION_OF_RESULT),
-    )
-    .join(grid, grid.c.id == run.c.grid_id)
-    .outerjoin(result, result.c.run_id == run.c.id)
-    .where(run.c.id == bindparam("wanted"), WHOLE)
-)
-_RESULT = select(result).where(result.c.run_id == bindparam("wanted"))
-_ESTIMATES = select(*ESTIMATE_COLUMNS).where(estimate.c.run_id == bindparam("wanted"))
-_ATTEMPTS = select(*ATTEMPT_COLUMNS).where(attempt.c.run_id == bindparam("wanted")).order_by(attempt.c.number)
-
-
-class NotFoundError(LookupError):
-    """There is no such thing in the database."""
 
 
 class KeyReusedError(ValueError):
@@ -107,11 +75,11 @@ class Created:
     replayed: bool
 
 
-class GridStore:
+class GridStore(RunStore):
     """Grids and runs in the database."""
 
     def __init__(self, database: Database, clock: Callable[[], datetime] = utc_now) -> None:
-        self._database = database
+        super().__init__(database)
         self._clock = clock
 
     def create(
@@ -209,56 +177,6 @@ class GridStore:
             items = self._views(connection, rows[:limit])
         return GridPage(items=items, next=items[-1].id if len(rows) > limit else None)
 
-    def runs(self, grid_id: str, limit: int, after: int = -1, state: RunState | None = None) -> RunPage:
-        """A page of a grid's runs; ``next`` holds the cursor."""
-        wanted = select(*RUN_COLUMNS).where(run.c.grid_id == grid_id, run.c.ordinal > after)
-        if state is not None:
-            wanted = wanted.where(run.c.state == state)
-        with self._database.read() as connection:
-            self._require(connection, grid_id)
-            rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
-        items = [run_view(row) for row in rows[:limit]]
-        return RunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
-
-    def run_items(self, grid_id: str, limit: int, after: int = -1, state: RunState | None = None) -> CompactRunPage:
-        """A page of a grid's runs in short; ``links`` of each has the keys of its artefacts."""
-        columns = (run.c.id, run.c.ordinal, run.c.label, run.c.state, run.c.error_code, run.c.finished_at)
-        wanted = select(*columns, result.c.figure, result.c.products).outerjoin(result, result.c.run_id == run.c.id)
-        wanted = wanted.where(run.c.grid_id == grid_id, run.c.ordinal > after)
-        if state is not None:
-            wanted = wanted.where(run.c.state == state)
-        with self._database.read() as connection:
-            self._require(connection, grid_id)
-            rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
-        items = [run_item(row) for row in rows[:limit]]
-        return CompactRunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
-
-    def run_version(self, wanted: str) -> tuple[Any, ...]:
-        """What changes whenever a run's document does, without reading that."""
-        with self._database.read() as connection:
-            row = connection.execute(_RUN_VERSION, {"wanted": wanted}).one_or_none()
-        if row is None:
-            raise NotFoundError(f"there is no run {wanted}")
-        return tuple(row)
-
-    def run(self, wanted: str) -> RunDetail:
-        """One run with result and attempts, checked."""
-        return RunDetail.model_validate(self.run_document(wanted)[1])
-
-    def run_document(self, wanted: str) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """Its :meth:`run_version`, and the same as plain data: one picture of the database, whose parts fit."""
-        parameters = {"wanted": wanted}
-        with self._database.read() as connection:
-            row = connection.execute(_RUN, parameters).one_or_none()
-            if row is None:
-                raise NotFoundError(f"there is no run {wanted}")
-            found = connection.execute(_RESULT, parameters).one_or_none()
-            estimates = [] if found is None else connection.execute(_ESTIMATES, parameters).all()
-            attempts = connection.execute(_ATTEMPTS, parameters).all()
-        version = [getattr(row, name) for name in _VERSION_OF_RUN]
-        version += [len(attempts), *(None if found is None else getattr(found, name) for name in _VERSION_OF_RESULT)]
-        return tuple(version), run_document(row, found, estimates, attempts)
-
     def owner(self, grid_id: str) -> str | None:
         """Whose grid it is; a NotFoundError where there is none."""
         with self._database.read() as connection:
@@ -333,7 +251,7 @@ class GridStore:
 
     def _revive_some(self, grid_id: str, wanted: RunFilter) -> int:
         with self._database.read() as connection:
-            self._require(connection, grid_id)
+            require_grid(connection, grid_id)
             found = wanted.runs(connection, grid_id, REVIVE.sources)
         revived = 0
         for first in range(0, len(found), PIECE):
@@ -358,7 +276,7 @@ class GridStore:
         """
         turns = Turns(self._database)
         with self._database.write() as connection:
-            self._require(connection, grid_id)
+            require_grid(connection, grid_id)
             lock_grids(connection, [grid_id])
             mark(connection)
             more = settle(connection, grid_id, self._clock())
@@ -402,11 +320,6 @@ class GridStore:
             else ended_grid_view(row)
             for row in rows
         ]
-
-    @staticmethod
-    def _require(connection: Connection, grid_id: str) -> None:
-        if connection.scalar(select(grid.c.id).where(grid.c.id == grid_id, WHOLE)) is None:
-            raise NotFoundError(f"there is no grid {grid_id}")
 
 
 def _workers(connection: Connection) -> int:

@@ -9,7 +9,7 @@ from sqlalchemy import Row, select
 from service.domain.states import RunState
 from service.domain.views import UWS_PHASES, MeasurementPage, MeasurementView, RunError
 from service.store.database import Database
-from service.store.grids import IS_IMAGE, WHOLE, NotFoundError
+from service.store.runs import IS_IMAGE, WHOLE, NotFoundError
 from service.store.tables import grid, measurement, run
 
 _SHORT = (

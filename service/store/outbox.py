@@ -6,7 +6,7 @@ from sqlalchemy import Integer, String, bindparam, func, select
 
 from service.domain.views import EventPage, EventView
 from service.store.database import Database
-from service.store.grids import WHOLE, NotFoundError
+from service.store.runs import WHOLE, NotFoundError
 from service.store.tables import event, grid
 
 _WANTED = bindparam("wanted", type_=String)

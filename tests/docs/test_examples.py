@@ -1,8 +1,13 @@
-"""What the documentation shows is run: blocks marked ``run`` against a real service, answers compared."""
+"""What the documentation shows is run: blocks marked ``run`` against a real service, answers compared.
+
+A person who has never seen it gets from the README to a figure of the biases of a lens of their own: by the command
+line, by curl and in Python, each as it is written there, with the real engine.
+"""
 
 from __future__ import annotations
 
 import doctest
+import json
 import os
 import re
 import subprocess
@@ -11,21 +16,30 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from astropy import units
+from astropy.table import QTable
 
+from engine import Analysis, Grid, expand, read_system, run
 from tests.docs.pages import PAGES, ROOT, Block, blocks
 from tests.service.service_process import Serving, serving
 
 SHORTER = {
     '"profile": "draft"': '"source_pixels": [12, 12], "max_steps": 10, "draws": 4',
     'Analysis(profile="draft")': "Analysis(source_pixels=(12, 12), max_steps=10, draws=4)",
-    "--profile draft": "--no-inversion",
+    "--profile draft": "--no-inversion --agn-images 4 --no-shear",
     '"magnitude": [20.5, 21.5]': '"magnitude": [20.5]',
     '"n_runs":4': '"n_runs":2',
 }
-"""Chains that are too short for any number, and half of the runs: as good for whether the commands work."""
+"""Chains that are too short for any number, and half of the runs: as good for whether the commands work.
+
+What an image that is measured blindly tells is asserted in tests/engine/test_measurement.py.
+"""
 MADE = {
     "docs/tutorial/first-grid.md": ["grid.json", "summary.json", "run.png", "biases.png"],
     "docs/howto/ask-for-biases.md": ["by_n.json", "trend.json", "comparison.json", "results.json", "results.ecsv"],
+    "docs/howto/from-python.md": ["bias.svg"],
+    "docs/howto/results-to-files.md": ["results.vot", "results.fits", "run.npz", "run.fits", "chain.nc", "run.json"],
+    "docs/howto/measure-by-http.md": ["found.json", "found.png"],
     "docs/howto/paper-figure.md": ["figure.pdf"],
     "docs/howto/measure-an-image.md": ["host.json", "host.png"],
 }
@@ -104,7 +118,7 @@ def run_page(page: Path, folder: Path, replaced: dict[str, str], url: str | None
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
     folder = tmp_path_factory.mktemp("service")
-    with serving(folder, HOSTLENS_TASK="service.worker:execute") as found:
+    with serving(folder, HOSTLENS_TASK="service.worker:execute", HOSTLENS_WORKERS="1") as found:
         yield found
 
 
@@ -119,3 +133,71 @@ def test_the_pages_that_need_a_service_do_what_they_show(service: Serving, tmp_p
 @pytest.mark.parametrize("page", pages_that_run("engine"), ids=lambda page: page.stem)
 def test_the_pages_that_need_the_engine_do_what_they_show(page: Path, tmp_path: Path) -> None:
     run_page(page, tmp_path, {})
+
+
+README, OWN_LENS = ROOT / "README.md", ROOT / "docs" / "howto" / "own-lens.md"
+FIELD = "field_pixels = 90", "field_pixels = 64"
+
+
+def shown(page: Path, language: str, part: str) -> str:
+    """The one block of a page that has a text in it, with one host instead of two."""
+    (found,) = [block.text for block in blocks(page) if block.language == language and part in block.text]
+    return found.replace("--n 2 --n 4", "--n 2").replace("[2, 4]", "[2]")
+
+
+def follow(service: Serving, folder: Path, text: str, language: str = "sh") -> str:
+    """What somebody sees who types it, in a checkout with hostlens on the path."""
+    own = f"127.0.0.1:{service.port}"
+    interpreter = ["/bin/bash", "-euo", "pipefail", "-c"] if language == "sh" else [sys.executable, "-c"]
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+        "MPLBACKEND": "agg",
+        "HOSTLENS_URL": f"http://{own}",
+        "COLUMNS": "80",
+    }
+    text = text.replace("localhost:8421", own)
+    done = subprocess.run(
+        [*interpreter, text],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=_TIMEOUT_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.timeout(4 * _TIMEOUT_S)
+def test_three_ways_from_a_file_to_the_biases_of_a_lens_give_the_same(service: Serving, tmp_path: Path) -> None:
+    toml = tmp_path / "docs" / "examples" / "my_system.toml"
+    toml.parent.mkdir(parents=True)
+    written = (ROOT / "docs" / "examples" / "my_system.toml").read_text()
+    assert FIELD[0] in written
+    toml.write_text(written.replace(*FIELD))
+    told = follow(service, tmp_path, shown(README, "sh", "--system docs/examples/my_system.toml"))
+    follow(service, tmp_path, shown(OWN_LENS, "sh", "curl"))
+    follow(service, tmp_path, shown(OWN_LENS, "python", "savefig"), "python")
+    ours, by_curl, by_command = service.client.grids().items[:3]
+    by_command_rows = service.client.summary(by_command.id, group_by="n").rows
+    assert by_command.name == "my own lens"
+    assert "<svg" in (tmp_path / "my_biases.svg").read_text()[:2000]
+    assert (tmp_path / "my_biases.png").read_bytes().startswith(b"\x89PNG")
+    # What the engine says of the same host, to the last digit that is told.
+    values = {"n": (2.0,), "r_eff": (0.35,), "magnitude": (21.0,), "l_eta": (1.0,)}
+    (one,) = expand(Grid(systems=(read_system(str(toml)),), **values, analysis=Analysis(estimators=("image",))))
+    expected = run(one.realization).estimate("image", "wide").magnitude
+    assert expected.bias is not None
+    table = QTable.read(tmp_path / "my_biases.ecsv")
+    assert table["magnitude_bias"].unit == units.mag
+    assert list(table["magnitude_mean"].value) == [expected.mean]
+    assert list(table["magnitude_bias"].value) == [expected.bias]
+    six = [float(f"{expected.bias:.6g}")]
+    answer = json.loads((tmp_path / "by_curl.json").read_text())
+    assert answer["question"]["filter"] == {"grid": [by_curl.id]}
+    assert [row["bias"]["mean"] for row in answer["rows"]] == six
+    assert [row.bias.mean for row in by_command_rows if row.bias is not None] == six
+    assert f"{six[0]:+.3f}" in told
+    assert ours.n_runs == by_curl.n_runs == by_command.n_runs == 1

@@ -10,17 +10,22 @@ from pathlib import Path
 
 import pytest
 
-import engine
+from engine import compiled
 
 WARNING = "compiled kernels are not kept"
-KERNELS = "engine/own_kernels.py"
+KERNELS = {
+    "own_kernels.py": "from engine.compiled import kernel\n\n\n@kernel\ndef twice(x):\n    return 2.0 * x\n",
+    "other_kernels.py": "from engine.compiled import kernel\n\n\n@kernel\ndef thrice(x):\n    return 3.0 * x\n",
+}
 
 
-def copy_of_the_engine(folder: Path) -> Path:
-    """The package with one kernel more, and without what has been compiled of it."""
-    shutil.copytree(Path(engine.__file__).parent, folder / "engine", ignore=shutil.ignore_patterns("__pycache__"))
-    source = "from engine.compiled import kernel\n\n\n@kernel\ndef twice(x):\n    return 2.0 * x\n"
-    (folder / KERNELS).write_text(source, encoding="utf-8")
+def kernels_in(folder: Path) -> Path:
+    """A package of the engine's name with its way to compile and two kernels: the whole would be loaded each time."""
+    (folder / "engine").mkdir()
+    (folder / "engine" / "__init__.py").touch()
+    shutil.copy(compiled.__file__, folder / "engine")
+    for name, source in KERNELS.items():
+        (folder / "engine" / name).write_text(source, encoding="utf-8")
     return folder
 
 
@@ -40,6 +45,7 @@ def compiled_anew(folder: Path, **variables: str) -> tuple[str, int]:
     code = (
         "from numba.core import event\n"
         "import os\n"
+        "from engine.other_kernels import thrice\n"
         "from engine.own_kernels import twice\n"
         "with event.install_recorder('numba:compile') as seen:\n"
         "    print(twice(1.0), twice(2), os.environ.get('HOME'))\n"
@@ -69,7 +75,7 @@ def read_only(folder: Path) -> Path:
 @pytest.fixture
 def installed(tmp_path: Path) -> Path:
     tmp_path.chmod(0o755)
-    return copy_of_the_engine(tmp_path)
+    return kernels_in(tmp_path)
 
 
 def test_without_a_place_kernels_are_compiled_in_memory_with_one_warning(installed: Path) -> None:

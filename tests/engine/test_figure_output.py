@@ -85,13 +85,13 @@ def test_the_same_points_in_any_order_are_the_same_bytes():
 
 
 def test_another_process_writes_the_same_bytes():
-    ours = [figure_bytes(figure, "svg") for figure in itertools.islice(figures(), 2)]
+    ours = figure_bytes(next(figures()), "svg")
     script = (
-        "import hashlib, itertools; from tests.engine.bias_records import figure_bytes, figures\n"
-        "for f in itertools.islice(figures(), 2): print(hashlib.sha256(figure_bytes(f, 'svg')).hexdigest())"
+        "import hashlib; from tests.engine.bias_records import figure_bytes, figures\n"
+        "print(hashlib.sha256(figure_bytes(next(figures()), 'svg')).hexdigest())"
     )
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert found.stdout.split() == [hashlib.sha256(data).hexdigest() for data in ours]
+    assert found.stdout.split() == [hashlib.sha256(ours).hexdigest()]
 
 
 def test_figures_drawn_at_once_are_those_drawn_alone():
@@ -107,7 +107,7 @@ def test_figures_drawn_at_once_are_those_drawn_alone():
     assert [found[i] for i in range(3)] == [alone] * 3
 
 
-@pytest.mark.parametrize("name", ["a $x_{$ b", "$5", "<b>&amp;", "ends\x07here", "two\nlines"])
+@pytest.mark.parametrize("name", ["a $x_{$ b <b>&amp;", "$5 ends\x07here\nin two lines"])
 def test_names_are_shown_as_they_stand_whatever_is_in_them(name):
     some = [replace(p, system=name) for p in paper_grid()[::12]]
     shown = "".join(c if c.isprintable() else " " for c in name)

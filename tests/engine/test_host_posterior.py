@@ -17,7 +17,9 @@ from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.priors import ParameterPrior
-from tests.engine.conftest import HELD_INDEX
+from engine.spec.realization import Realization
+from engine.spec.sky import Host
+from tests.engine.conftest import HELD_INDEX, cut
 
 N = COORDINATES.index("n")
 
@@ -136,8 +138,7 @@ def test_a_fit_with_n_held_is_where_the_gaussian_says_and_narrower(fit: Parametr
 
 
 def test_an_index_beyond_the_papers_range_ends_at_its_bound() -> None:
-    realization = next(one for one in paper_runs(("HE0435",), "draft") if one.host.n == 4.0)
-    peaked = replace(realization, host=replace(realization.host, n=5.0))
+    peaked = Realization(system=cut(), l_eta=1.0, host=Host(n=5.0, r_eff=0.39, magnitude=20.5))
     simulation = simulate_realization(peaked)
     found = fit_parametric(simulation.observation, agn_images=4)
     assert set(found.hosts) == {"wide", "free"}
@@ -148,22 +149,25 @@ def test_an_index_beyond_the_papers_range_ends_at_its_bound() -> None:
 
 
 def test_priors_of_the_lens_are_kept(scene: Scene, simulation: Simulation) -> None:
-    near = {"slope": ParameterPrior(mean=1.9, sd=1e-4), "theta_E": ParameterPrior(high=scene.lens.theta_E - 0.002)}
+    # Far enough for the data to object, and not for chi^2 to grow, which every error would.
+    near = {"slope": ParameterPrior(mean=1.92, sd=1e-4), "theta_E": ParameterPrior(high=scene.lens.theta_E - 0.001)}
     found = fit_parametric(simulation.observation, agn_images=4, priors=near)
     # The data know the slope to 0.005, the prior to 0.0001.
-    assert found.lens.slope == pytest.approx(1.9, abs=1e-3)
-    assert found.lens.theta_E <= scene.lens.theta_E - 0.002
+    assert found.lens.slope == pytest.approx(1.92, abs=1e-3)
+    assert found.lens.theta_E <= scene.lens.theta_E - 0.001
     assert "lens.theta_E" in found.at_bound
     assert found.lens_covariance[3, 3] ** 0.5 == pytest.approx(1e-4, rel=0.1)
 
 
-@pytest.mark.parametrize(("n", "r_eff", "magnitude"), [(4.0, 0.3, 22.0), (2.0, 0.6, 21.5)])
+@pytest.mark.parametrize(
+    ("n", "r_eff", "magnitude"), [(4.0, 0.3, 22.0), pytest.param(2.0, 0.6, 21.5, marks=pytest.mark.long)]
+)
 def test_a_faint_arc_does_not_lead_the_host_astray(n: float, r_eff: float, magnitude: float) -> None:
     """With the lens of the free-form posterior and a free sky these were off by -0.42 and +0.40 mag."""
     wanted = (n, r_eff, magnitude)
     runs = paper_runs(("HE0047",), "draft")
     (one,) = [run for run in runs if (run.host.n, run.host.r_eff, run.host.magnitude) == wanted]
-    simulation = simulate_realization(one)
+    simulation = simulate_realization(replace(one, system=cut("HE0047", 100)))
     found = fit_parametric(simulation.observation, agn_images=2)
     found_magnitude = rate_to_magnitude(found.host.flux, simulation.observation.zero_point)
     sd = math.sqrt(found.hosts["wide"].covariance[0, 0]) * 2.5 / math.log(10.0)

@@ -43,7 +43,7 @@ SET = [
     (Explicit(correlated=True), SourceModel((20, 34), "gradient")),
     (Explicit(subrays=1), SourceModel((60, 10), "gradient")),
     (Explicit(), SourceModel((40, 40), "curvature")),
-    (Explicit(), SourceModel((60, 60))),
+    pytest.param(Explicit(), SourceModel((60, 60)), marks=pytest.mark.long),
 ]
 
 

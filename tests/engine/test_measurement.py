@@ -27,20 +27,20 @@ from engine import (
 from engine.figures import measurement_figure
 from engine.imaging.observation import Observation
 from engine.measurement_files import write_measurement
-from engine.parametric.fit import ParametricFit, fit_parametric
+from engine.parametric.fit import fit_parametric
 from engine.simulation.simulate import Simulation
-from tests.engine.conftest import HELD_INDEX
+from tests.engine.conftest import cut
 
 SHARED_DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
 
 @pytest.fixture(scope="module")
-def found(simulation: Simulation) -> ImageMeasurement:
-    return measure_image(simulation.observation, inversion=False)
+def found(wide: Simulation) -> ImageMeasurement:
+    return measure_image(wide.observation, inversion=False)
 
 
-def test_an_image_is_measured_without_being_told_what_is_in_it(simulation: Simulation, found: ImageMeasurement) -> None:
-    scene = simulation.scene
+def test_an_image_is_measured_without_being_told_what_is_in_it(wide: Simulation, found: ImageMeasurement) -> None:
+    scene = wide.scene
     assert len(found.agn) == len(scene.agn)
     assert found.status == "ok"
     # The bounds are those of the errors that the measurement itself gives, tripled.
@@ -56,11 +56,11 @@ def test_an_image_is_measured_without_being_told_what_is_in_it(simulation: Simul
     assert "gamma1" not in found.lens, "the lens has no shear, and the data do not ask for any"
 
 
-def test_fit_and_inversion_tell_their_chi2_in_the_same_noise(simulation: Simulation) -> None:
+def test_fit_and_inversion_tell_their_chi2_in_the_same_noise(wide: Simulation) -> None:
     # A noise map of half the noise, exposures unknown: to the inversion the rest is what the fit misses.
-    seen = simulation.observation
+    seen = wide.observation
     halved = replace(seen, noise=0.5 * seen.noise, response=None, covariance=None)
-    found = measure_image(halved, agn_images=len(simulation.scene.agn), shear=False, profile="draft")
+    found = measure_image(halved, agn_images=len(wide.scene.agn), shear=False, profile="draft")
     assert found.noise_scale == pytest.approx(2.0, abs=0.15)
     assert found.chi2_per_dof_as_given > 2.0
     # Both describe the image; what errors of stamps are allowed for makes them smaller than one.
@@ -70,7 +70,7 @@ def test_fit_and_inversion_tell_their_chi2_in_the_same_noise(simulation: Simulat
 
 
 def test_an_arc_without_agn_is_found_from_its_ring() -> None:
-    system = replace(load_system("HE0435"), agn=())
+    system = replace(cut(), agn=())
     realization = Realization(system=system, l_eta=1.0, host=Host(n=1.5, r_eff=0.3, magnitude=21.0))
     observation = simulate_realization(realization).observation
     lens = load_system("HE0435").mass_models["recommended"]["1.0"]
@@ -98,12 +98,6 @@ def test_the_result_is_plain_json_with_the_promised_fields(found: ImageMeasureme
         assert key in document
 
 
-def test_the_same_image_gives_the_same_numbers(simulation: Simulation, fit: ParametricFit) -> None:
-    again = fit_parametric(simulation.observation, agn_images=4, fixed_index=HELD_INDEX)
-    assert (again.host, again.lens, again.agn) == (fit.host, fit.lens, fit.agn)
-    assert np.array_equal(again.lens_covariance, fit.lens_covariance)
-
-
 def test_an_image_of_nothing_has_no_lens(simulation: Simulation) -> None:
     rng = np.random.default_rng(0)
     seen = simulation.observation
@@ -116,7 +110,7 @@ def test_an_image_of_nothing_has_no_lens(simulation: Simulation) -> None:
 
 def test_a_bad_fit_is_no_start(simulation: Simulation) -> None:
     whole = simulation.observation
-    middle = (slice(20, 79), slice(20, 79))
+    middle = (slice(3, 62), slice(3, 62))
     seen = Observation(whole.image[middle], whole.noise[middle], whole.psf, whole.pixel_scale, whole.zero_point)
     y, x = np.indices(seen.shape) - 29.0
     # Twelve bright blobs that no lens makes.

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from engine.catalogue import load_system
 from engine.conventions import rate_to_magnitude
 from engine.estimators.draws import source_draw
 from engine.estimators.refit import refit_draws
@@ -28,6 +27,7 @@ from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
+from tests.engine.conftest import cut
 
 SAME = 0.05
 """Magnitudes."""
@@ -91,7 +91,7 @@ def test_the_true_slope_finds_the_same_host_as_the_slope_of_highest_evidence(
 
 
 def test_a_deflector_without_light_leaves_the_host(simulation: Simulation, usual: Found) -> None:
-    dark = replace(load_system("HE0435"), deflector=None)
+    dark = replace(cut(), deflector=None)
     other = simulate_realization(Realization(system=dark, l_eta=1.0, host=BRIGHT))
     alone = fit_parametric(other.observation, agn_images=4, deflector=False)
     assert_same(find(other, alone, Analysis(), other.scene.lens), usual)

@@ -204,11 +204,11 @@ def task_of(observation: Observation) -> Task:
     return Task(observation, deflector=True, shear=False, acceptance=GOOD_START, priors={})
 
 
-def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulation: Simulation) -> None:
+def test_an_agn_image_that_would_leave_its_bounds_is_told(wide: Simulation) -> None:
     # Three pixels from where it is: its bounds are two pixels about where the fit begins.
-    shift = 3.0 * simulation.observation.pixel_scale
-    places = [(agn.x + (shift if k == 0 else 0.0), agn.y) for k, agn in enumerate(scene.agn)]
-    task = task_of(simulation.observation)
+    shift = 3.0 * wide.observation.pixel_scale
+    places = [(agn.x + (shift if k == 0 else 0.0), agn.y) for k, agn in enumerate(wide.scene.agn)]
+    task = task_of(wide.observation)
     (group,) = find_starts(task, None, None, places)
     (found,) = quick_fits(task, group)
     assert "agn1.x" in found.at_bound
@@ -217,25 +217,25 @@ def test_an_agn_image_that_would_leave_its_bounds_is_told(scene: Scene, simulati
     assert not found.at_bound
 
 
-@pytest.mark.parametrize("name", ["agn1.x", "agn2.y", "lens.theta_E", "lens.x", "host.y", "deflector.x"])
-def test_what_strays_from_its_start_fit_by_fit_is_told(simulation: Simulation, name: str) -> None:
-    task = task_of(simulation.observation)
+def test_what_strays_from_its_start_fit_by_fit_is_told(wide: Simulation) -> None:
+    task = task_of(wide.observation)
     (group,) = find_starts(task, 4, None, None)
     start = group[0]
     (found,) = quick_fits(task, [start])
     space = found.space
-    k = space.names.index(name)
-    low, high = space.bounds(start.vector(space), simulation.observation.pixel_scale, {})
-    # One fit ends just inside its bounds, and the next one, whose bounds lie round that, goes on from there.
-    away = found.values.copy()
-    away[k] = low[k] + 0.01 * (high[k] - low[k])
-    assert name not in replace(found, values=away).at_bound
-    away[k] = low[k] - 0.1 * (high[k] - low[k])
-    own_low, own_high = found.low.copy(), found.high.copy()
-    own_low[k], own_high[k] = away[k] - 1.0, away[k] + 1.0
-    again = replace(found, values=away, low=own_low, high=own_high)
-    assert not space.at_bound(away, own_low, own_high)
-    assert again.at_bound == (name,)
+    low, high = space.bounds(start.vector(space), wide.observation.pixel_scale, {})
+    for name in ("agn1.x", "agn2.y", "lens.theta_E", "lens.x", "host.y", "deflector.x"):
+        k = space.names.index(name)
+        # One fit ends just inside its bounds, and the next one, whose bounds lie round that, goes on from there.
+        away = found.values.copy()
+        away[k] = low[k] + 0.01 * (high[k] - low[k])
+        assert name not in replace(found, values=away).at_bound
+        away[k] = low[k] - 0.1 * (high[k] - low[k])
+        own_low, own_high = found.low.copy(), found.high.copy()
+        own_low[k], own_high[k] = away[k] - 1.0, away[k] + 1.0
+        again = replace(found, values=away, low=own_low, high=own_high)
+        assert not space.at_bound(away, own_low, own_high)
+        assert again.at_bound == (name,)
 
 
 def test_what_one_candidate_shows_of_its_stamps_is_not_taken_over_by_the_next(simulation: Simulation) -> None:

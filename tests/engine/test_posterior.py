@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
+from engine.likelihood.w_tilde import together
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
+from engine.posterior.proposal import StudentProposal
 from engine.posterior.surrogate import learn_surrogate
 from engine.posterior.target import Prior, Recorded, Target, wide_prior
 from engine.source.regularisation import SourceModel
@@ -104,8 +106,10 @@ def test_a_surrogate_knows_what_it_was_told_and_nothing_outside_the_prior() -> N
     surrogate = learn_surrogate(known, target.prior, laplace, np.random.RandomState(0))
     points, values = np.array(known.points), np.array(known.values)
     near = values > values.max() - 7.0
-    # It stops learning at an error of 0.35 at places that it does not know yet.
-    assert np.abs(surrogate.ln_density(points[near]) - values[near]).max() < 0.35
+    # It stops learning at an rms error of 0.3 at places that it does not know yet; those that it knows it smooths.
+    error = surrogate.ln_density(points[near]) - values[near]
+    assert np.sqrt(np.mean(error**2)) < 0.2
+    assert np.abs(error).max() < 0.6
     assert surrogate.ln_density(np.full((1, 7), 60.0))[0] == -math.inf
     ends, _, _ = surrogate.walk(points[:9], 20, np.random.RandomState(1))
     assert all(target.prior.holds(end) for end in ends)
@@ -192,6 +196,34 @@ def test_outside_the_prior_nothing_is_evaluated() -> None:
     assert target.evaluations == 0
     with pytest.raises(PosteriorError, match="start"):
         find_optimum(target, outside, start_covariance(np.eye(8) * 1e-4))
+
+
+def test_places_asked_for_together_have_the_value_that_each_has_alone_bit_by_bit() -> None:
+    """More of them than share a pass over W, one outside the prior and one whose inversion is refused among them."""
+    target = Target(Case().likelihood(), wide_prior(LENS, shear=True), SourceModel((20, 20)))
+    assert together(400) == 4
+    places = np.array([target.vector(LENS.with_values(slope=2.0 + 0.01 * k), -1.0 + 0.1 * k) for k in range(7)])
+    places[2, 1] = 1.2
+    target.prior.low[-1] = -300.0
+    places[4, -1] = -250.0
+    found = target.many(places)
+    assert (target.evaluations, target.refused) == (6, 1)
+    assert found.tolist() == [target(values) for values in places]
+    assert np.flatnonzero(~np.isfinite(found)).tolist() == [2, 4]
+
+
+def test_a_surrogate_of_a_gaussian_has_nothing_to_unlearn() -> None:
+    """Where the approximation is right, one round of lessons shows it: no more are taken."""
+    target = Gaussian()
+    laplace = find_optimum(target, target.mean, np.eye(5))
+    found = target.evaluations
+    known = Recorded(target, *map(list, laplace.known or ([], [])))
+    surrogate = learn_surrogate(known, target.prior, laplace, np.random.RandomState(0))
+    assert target.evaluations - found == 30
+    # A Student density of 30 degrees of freedom differs from the normal one by 0.4 there.
+    states = StudentProposal(target.mean, 0.3 * target.covariance).draw(100, np.random.RandomState(1))
+    error = surrogate.ln_density(states) - np.array([target(state) for state in states])
+    assert np.abs(error - error.mean()).max() < 0.25
 
 
 def test_a_lens_without_shear_has_no_shear_parameters() -> None:

@@ -19,18 +19,19 @@ from engine import (
     check_analysis,
     compare,
     load_system,
-    simulate_realization,
 )
 from engine.catalogue import system_names
 from engine.experiment import analysis_of
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.evidence import ln_evidence
+from engine.parametric.fit import ParametricFit
 from engine.posterior.agn_positions import AgnPositions
 from engine.posterior.target import Target, wide_prior
 from engine.source.regularisation import SourceModel
 from engine.spec.priors import ParameterPrior
 from engine.spec.realization import realization_from_dict
+from tests.engine.conftest import QUICK
 from tests.engine.dense_oracle import Case
 
 LENS = PowerLawLens(1.2, 0.75, 0.6, 2.05, 0.01, -0.02, 0.0, 0.0)
@@ -153,28 +154,25 @@ def test_every_system_states_its_priors_and_they_hold_its_models(name: str) -> N
     assert {"theta_E", "q", "slope"} <= set(system.priors)
 
 
-def measured(simulation: Simulation, **asked: object) -> Reconstruction:
+def measured(simulation: Simulation, fit: ParametricFit, **asked: object) -> Reconstruction:
     return analyse(
         simulation.observation,
-        realization(**asked, draws=10, max_steps=60, estimators=("paper",)).analysis,
+        replace(QUICK, draws=10, max_steps=30, estimators=("paper",), **asked),  # type: ignore[arg-type]
         np.random.default_rng(1),
-        agn_images=len(simulation.scene.agn),
+        fit=fit,
     )
 
 
 @pytest.fixture(scope="module")
-def simulation() -> Simulation:
-    return simulate_realization(realization())
-
-
-@pytest.fixture(scope="module")
-def plain(simulation: Simulation) -> Reconstruction:
+def plain(simulation: Simulation, fit: ParametricFit) -> Reconstruction:
     """Without priors, positions or a known background."""
-    return measured(simulation)
+    return measured(simulation, fit)
 
 
-def test_priors_and_positions_narrow_the_posterior(simulation: Simulation, plain: Reconstruction) -> None:
-    told = measured(simulation, priors={"slope": ParameterPrior(mean=2.0, sd=0.002)}, agn_position_sd=0.002)
+def test_priors_and_positions_narrow_the_posterior(
+    simulation: Simulation, plain: Reconstruction, fit: ParametricFit
+) -> None:
+    told = measured(simulation, fit, priors={"slope": ParameterPrior(mean=2.0, sd=0.002)}, agn_position_sd=0.002)
     without, sd = ({p.name: p.value.sd for p in found.lens} for found in (plain, told))
     assert sd["slope"] == pytest.approx(0.002, rel=0.4)
     assert sd["slope"] < 0.5 * without["slope"]
@@ -189,11 +187,11 @@ def test_a_run_takes_the_systems_priors_where_it_states_none() -> None:
 
 
 def test_a_known_background_is_held_and_gives_the_host_its_wings_back(
-    simulation: Simulation, plain: Reconstruction
+    simulation: Simulation, plain: Reconstruction, fit: ParametricFit
 ) -> None:
     """The simulation's sky is taken off exactly. A free background of the ring takes 0.3 mag of `paper`'s host."""
     bias = {}
-    for name, found in (("free", plain), ("known", measured(simulation, background_sd=1e-3))):
+    for name, found in (("free", plain), ("known", measured(simulation, fit, background_sd=1e-3))):
         bias[name] = compare(found, realization(), simulation).estimate("paper", "wide").magnitude.bias
     assert bias["free"] is not None
     assert bias["known"] is not None

@@ -1,4 +1,4 @@
-"""A whole run: what comes back, and that it comes back the same."""
+"""A whole run: what comes back. That it is the same bits in every process is test_end_to_end's, on real workers."""
 
 import io
 import math
@@ -17,7 +17,6 @@ from engine import (
     analyse,
     compare,
     generator,
-    load_system,
     realization_from_dict,
     run,
 )
@@ -26,6 +25,7 @@ from engine.parametric.fit import ParametricFit
 from engine.result import INDEX_PRIORS
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import ESTIMATORS
+from tests.engine.conftest import HELD_INDEX, cut
 
 
 @pytest.fixture(scope="module")
@@ -93,28 +93,6 @@ def test_even_a_coarse_reconstruction_finds_the_host(result: RunResult) -> None:
     assert result.estimate("paper", "free").magnitude.bias == pytest.approx(0.2, abs=0.15)
 
 
-def test_every_process_gives_the_same_bits_and_another_seed_others(realization: Realization, result: RunResult) -> None:
-    """Two workers beside each other, and the process of this test: three in all."""
-    from distributed import Client, LocalCluster
-
-    other = replace(realization, seed=1)
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0") as cluster,
-        Client(cluster) as client,
-    ):
-        first, second = client.gather(client.map(run, [realization, other], pure=False))
-    assert first.estimates == result.estimates
-    assert first.lens == result.lens
-    assert second.estimates != result.estimates
-    assert first.products is not None
-    assert result.products is not None
-    one, two = first.products.arrays(), result.products.arrays()
-    assert one.keys() == two.keys()
-    assert {"image", "residual", "source", "source_truth", "chain"} <= one.keys()
-    for name, values in one.items():
-        assert np.array_equal(values, two[name])
-
-
 def test_progress_names_the_stages_in_order(result: RunResult, stages_told: list[str]) -> None:
     assert stages_told == [stage.stage for stage in result.stages] == list(STAGES)
 
@@ -155,26 +133,15 @@ def test_image_alone_needs_no_chain_and_says_the_same(realization: Realization, 
     assert len(figure.axes) == 6
 
 
-def test_an_estimator_that_is_not_asked_for_has_no_answer(
-    simulation: Simulation, realization: Realization, fit: ParametricFit
-) -> None:
-    asked = replace(realization.analysis, estimators=("projected",))
-    found = analyse(simulation.observation, asked, generator(realization, 1), fit=fit)
-    assert {estimate.estimator for estimate in found.estimates} == {"projected"}
-    assert found.inversion is not None
-    # The aperture lies where `paper` puts it.
-    assert found.inversion.aperture is None
-    assert not any("aperture" in warning for warning in found.warnings)
-
-
 def test_a_prior_of_n_that_no_fit_of_the_image_meets_is_missing_with_a_warning(
-    simulation: Simulation, realization: Realization
+    simulation: Simulation, realization: Realization, fit: ParametricFit
 ) -> None:
     alone = replace(realization.analysis, estimators=("image",))
     rng = np.random.default_rng(0)
-    whole = analyse(simulation.observation, alone, rng, agn_images=4, fixed_index=2.0)
-    fit = replace(whole.fit, hosts={"wide": whole.fit.hosts["wide"]})
-    found = analyse(simulation.observation, alone, rng, fit=fit, fixed_index=2.0)
+    whole = analyse(simulation.observation, alone, rng, fit=fit, fixed_index=HELD_INDEX)
+    assert len(whole.estimates) == len(INDEX_PRIORS)
+    lacking = replace(fit, hosts={"wide": fit.hosts["wide"]})
+    found = analyse(simulation.observation, alone, rng, fit=lacking, fixed_index=HELD_INDEX)
     assert found.estimates == whole.estimates[:1]
     assert [warning.split(":")[0] for warning in found.warnings] == [
         "image estimator, n free",
@@ -183,14 +150,20 @@ def test_a_prior_of_n_that_no_fit_of_the_image_meets_is_missing_with_a_warning(
 
 
 def test_a_system_of_ones_own_without_deflector_light_and_with_shear(realization: Realization) -> None:
-    own = replace(load_system("HE0435"), deflector=None)
-    found = run(replace(realization, system=own, mass_model="epl_shear"))
+    """And of one estimator: one that is not asked for has no answer."""
+    own = replace(cut(), deflector=None)
+    asked = replace(realization.analysis, estimators=("projected",))
+    found = run(replace(realization, system=own, mass_model="epl_shear", analysis=asked))
     names = [parameter.name for parameter in found.lens]
     assert names == ["theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda"]
     shear = next(parameter for parameter in found.lens if parameter.name == "gamma1")
     # The catalogue's shear, found without having been told: within the coarse grid's model error.
     assert shear.value.mean == pytest.approx(0.040, abs=0.03)
     assert found.estimate("projected", "free").magnitude.bias == pytest.approx(0.0, abs=0.15)
+    assert {estimate.estimator for estimate in found.estimates} == {"projected"}
+    # The aperture lies where `paper` puts it.
+    assert found.aperture is None
+    assert not any("aperture" in warning for warning in found.warnings)
 
 
 def test_a_slope_without_a_mass_model_is_refused_by_field() -> None:

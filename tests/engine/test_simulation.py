@@ -15,19 +15,22 @@ from engine.simulation.seeds import generator
 from engine.simulation.simulate import Simulation
 
 LEVELS = ("author", "handbook")
+ALL = [(name, "author") for name in system_names()]
+BOTH = [("HE0435", "handbook"), ("HE0047", "handbook")]
+"""One camera that has a noise of the author's and one that has not, at the other level."""
 
 
 @pytest.fixture(scope="session")
 def simulations() -> dict[tuple[str, str], Simulation]:
-    """Run 17 of each system (n = 2, the smaller R_eff, the second brightest host, l_eta = 1) at each noise level."""
+    """Run 17 of each system (n = 2, the smaller R_eff, the second brightest host, l_eta = 1)."""
     found = {}
-    for name, level in itertools.product(system_names(), LEVELS):
+    for name, level in ALL + BOTH:
         spec = expand(Grid(preset=f"h0licow-vi/{name}", noise_level=level))[16].realization
         found[name, level] = simulate_realization(spec)
     return found
 
 
-@pytest.mark.parametrize(("name", "level"), list(itertools.product(system_names(), LEVELS)))
+@pytest.mark.parametrize(("name", "level"), ALL + BOTH)
 def test_every_system_simulates_at_both_noise_levels_and_says_which_was_used(simulations, name, level):
     simulation = simulations[name, level]
     observation, scene = simulation.observation, simulation.scene
@@ -43,7 +46,7 @@ def test_every_system_simulates_at_both_noise_levels_and_says_which_was_used(sim
 
 
 def test_the_two_noise_levels_differ_where_the_camera_has_both(simulations):
-    for name in system_names():
+    for name, _ in BOTH:
         author, handbook = (simulations[name, level].observation.noise for level in LEVELS)
         if load_camera(simulations[name, "author"].scene.system.camera).noise_author is None:
             np.testing.assert_array_equal(author, handbook)
@@ -54,7 +57,7 @@ def test_the_two_noise_levels_differ_where_the_camera_has_both(simulations):
 def test_agn_stand_at_the_brightest_pixels_of_the_picture(simulations):
     # The core of each AGN is brighter than its deflector and its host, in all eight systems but at RXJ1131's faint D.
     for name in system_names():
-        observation, scene = simulations[name, "handbook"].observation, simulations[name, "handbook"].scene
+        observation, scene = simulations[name, "author"].observation, simulations[name, "author"].scene
         ny, nx = observation.shape
         for source in scene.agn:
             row, column = (

@@ -14,10 +14,10 @@ from pathlib import Path
 from tests.sources import parsed
 
 HERE = Path(__file__).parent
-PAGE = HERE.parents[1] / "docs" / "hard-cases.md"
+PAGE = HERE.parents[1] / "docs" / "reference" / "hard-cases.md"
 ORDER = ("lenses", "light", "inversions", "precision", "chains", "hosts", "size", "no_sentinels")
 RISK, PROMISE = "Could go wrong:", "Holds:"
-HEAD = """# Hard cases
+HEAD = """# Hard cases, test by test
 
 <!-- Made by `python -m tests.hard_cases.page` of the docstrings in tests/hard_cases: change those, not this. -->
 

@@ -232,7 +232,8 @@ def test_a_saturated_pixel_is_not_used_whatever_its_value(scene: Scene, simulati
     of one datum fewer.
     """
     observation, fit = simulation.observation, true_fit(scene)
-    row, column = np.argwhere(prepare_problem(observation, fit, Analysis(noise_treatment="diagonal")).mask)[300]
+    whole = prepare_problem(observation, fit, Analysis(noise_treatment="diagonal"))
+    row, column = np.argwhere(whole.mask)[300]
     valid = observation.valid.copy()
     valid[row, column] = False
     values = []
@@ -245,7 +246,6 @@ def test_a_saturated_pixel_is_not_used_whatever_its_value(scene: Scene, simulati
         assert not problem.mask[row, column]
         values.append(ln_evidence(problem.likelihood, fit.lens, -9.0, SourceModel((12, 12))))
     assert values[0] == values[1] == values[2]
-    whole = prepare_problem(observation, fit, Analysis(noise_treatment="diagonal"))
     assert problem.likelihood.data_points == whole.likelihood.data_points - 1
 
 

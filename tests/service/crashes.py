@@ -150,13 +150,15 @@ OPERATIONS = {
 }
 
 
-def die_at(url: str, name: str, scene: Scene, boundary: int, *, within: bool = True) -> None:
+def die_at(url: str, name: str, scene: Scene, boundary: int, *, within: bool = True, commits: bool = False) -> None:
     """Carry out an operation in this process, and die without a word at its ``boundary``-th boundary.
 
-    Not ``within`` its transactions only those between two of them count.
+    Not ``within`` its transactions only those between two of them count; with ``commits`` those before and after each
+    commit alone, be the connection given back or not.
     """
     with stores(url) as mine:
         passed = 0
+        committed = False
 
         def boundary_passed(*_: Any, **__: Any) -> None:
             nonlocal passed
@@ -164,6 +166,23 @@ def die_at(url: str, name: str, scene: Scene, boundary: int, *, within: bool = T
             if passed == boundary:
                 os._exit(DEAD)
 
+        def committing(*_: Any) -> None:
+            nonlocal committed
+            boundary_passed()
+            committed = True
+
+        def after_a_commit(*_: Any, **__: Any) -> None:
+            nonlocal committed
+            if committed:
+                boundary_passed()
+            committed = False
+
+        if commits:
+            event.listen(mine.database.engine, "commit", committing)
+            event.listen(mine.database.engine, "before_cursor_execute", after_a_commit)
+            event.listen(mine.database.engine.pool, "reset", after_a_commit)
+            OPERATIONS[name].act(mine, scene)
+            return
         if within:
             event.listen(mine.database.engine, "before_cursor_execute", boundary_passed)
             event.listen(mine.database.engine, "commit", _before(boundary_passed))

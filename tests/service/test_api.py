@@ -354,3 +354,12 @@ def test_identifiers_sort_by_time_and_place() -> None:
     first = new_grid_id(utc_now())
     assert len(first) == 28
     assert run_id(first, 2) < run_id(first, 10)
+
+
+def test_a_map_that_does_not_show_all_runs_says_so(api: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid = api.post("/v1/grids", json=body(3)).json()["id"]
+    assert "The map shows" not in api.get(f"/grids/{grid}").text
+    monkeypatch.setattr("service.api.site.grids._MOST_CELLS", 2)
+    shown = api.get(f"/grids/{grid}").text
+    assert "The map shows the first 2 of 3 runs; figures and biases are of all." in shown
+    assert shown.count('href="/runs/') == 2

@@ -8,6 +8,7 @@ import subprocess
 import tempfile
 import threading
 import time
+import tracemalloc
 from base64 import b64encode
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -83,6 +84,22 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("a file system of its own needs root, and the right to mount one")
     yield place
     subprocess.run(["umount", str(place)], check=True)  # noqa: S607 - wherever it is installed
+
+
+def test_what_a_file_holds_is_stored_from_its_beginning_without_memory_for_it(tmp_path: Path) -> None:
+    store, size = ArtefactStore(str(tmp_path / "artefacts")), 64 * 2**20
+    with (tmp_path / "large").open("w+b") as file:
+        file.truncate(size)
+        file.seek(17)
+        tracemalloc.start()
+        made = store.put_file(file, "fits")
+        again = store.put_file(file, "fits")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert made == again
+    assert peak < size / 10  # a piece of 1 MiB, and what is being read meanwhile
+    assert Path(store.path(made.key)).stat().st_size == size
+    assert made == store.put(bytes(size), "fits")
 
 
 @pytest.mark.parametrize("left", [b"", PNG[:20], PNG[::-1]], ids=["empty", "cut off", "other bytes"])

@@ -322,3 +322,14 @@ class TestConnections:
             "sys.exit(any(name in sys.modules for name in ('engine', 'numpy', 'astropy', 'pandas', 'sqlalchemy')))"
         )
         assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_an_error_names_the_place_once() -> None:
+    for pointer, message, told in (
+        ("/n", "n: got 3.0, allowed is 2", "n: got 3.0, allowed is 2"),
+        ("/systems/0/agn", "systems[0].agn: got 1", "systems[0].agn: got 1"),
+        ("group_by", "group_by: got 'seed'", "group_by: got 'seed'"),
+        ("/n", "no number", "/n: no number"),
+        ("/image", "not a FITS file; allowed is: one", "/image: not a FITS file; allowed is: one"),
+    ):
+        assert str(ApiError(422, {"errors": [{"pointer": pointer, "message": message}]})) == told

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import io
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from fastapi.testclient import TestClient
 from PIL import Image
 
 from service.api.app import create_app
 from service.domain.identifiers import new_grid_id, utc_now
+from service.figures.apart import DrawingProcess
 from service.figures.kept import KeptFigures
 from service.figures.question import FIGURE_KINDS
 from service.runtime.settings import Settings
@@ -23,6 +29,7 @@ from service.store.database import Database
 from service.store.leadership import Leadership
 from service.store.queue import RunQueue
 from tests.service.plans import BODY, result_of
+from tests.service.service_process import ROOT, eventually
 
 TWO = {"preset": "h0licow-vi", "systems": ["HE0435", "RXJ1131"], "n": [2], "l_eta": [1.0]}
 
@@ -64,6 +71,8 @@ def detail(answer: object, status: int) -> str:
     return str(answer.json()["detail"])
 
 
+# What is drawn comes from the same models on both; what is asked of a database is asked below.
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
 def test_every_figure_of_a_grid_is_drawn_as_svg_and_png(api: TestClient, settings: Settings) -> None:
     grid_id = grid(api, {**TWO, "name": "two <systems>"})
     work(settings)
@@ -77,6 +86,13 @@ def test_every_figure_of_a_grid_is_drawn_as_svg_and_png(api: TestClient, setting
         assert Image.open(io.BytesIO(png.content)).width > 400
         if kind != "montage":
             assert api.get(f"/v1/figures/{kind}.svg?system=HE0435").status_code == 200
+
+
+def test_the_title_of_a_grid_without_a_name_is_not_its_identifier(api: TestClient, settings: Settings) -> None:
+    grid_id = grid(api, {**BODY, "replicates": 2})
+    work(settings)
+    for kind in ("bias", "montage"):
+        assert grid_id not in api.get(f"/v1/grids/{grid_id}/figures/{kind}.svg").text
 
 
 def test_a_figure_shows_the_runs_that_the_filter_means(api: TestClient, settings: Settings) -> None:
@@ -144,3 +160,28 @@ def test_figures_are_drawn_one_at_a_time_once_each_and_kept_in_bounds() -> None:
     assert len(kept.get("d", lambda: draw("d", 1000))) == 1000  # larger than the room: given, not kept
     kept.get("d", lambda: draw("d", 1000))
     assert drawn.count("d") == 2
+
+
+def test_figures_are_drawn_in_a_process_of_their_own_which_is_begun_anew_where_it_was_killed() -> None:
+    drawing = DrawingProcess()
+    first = drawing.call(os.getpid)
+    assert drawing.call(os.getpid) == first != os.getpid()
+    with pytest.raises(ValueError, match="invalid literal"):
+        drawing.call(int, "none")
+    os.kill(first, signal.SIGKILL)
+    assert drawing.call(os.getpid) not in (first, os.getpid())
+
+
+def test_the_process_that_draws_ends_with_the_one_that_asks_even_where_that_is_killed() -> None:
+    program = (
+        "import os\nfrom service.figures.apart import DrawingProcess\n"
+        "print(DrawingProcess().call(os.getpid), flush=True)\nos.kill(os.getpid(), 9)"
+    )
+    told = subprocess.run([sys.executable, "-c", program], check=False, stdout=subprocess.PIPE, cwd=ROOT)
+    number = int(told.stdout)
+
+    def is_gone() -> bool:
+        # One that nobody has asked for its end is none any more.
+        return not psutil.pid_exists(number) or psutil.Process(number).status() == psutil.STATUS_ZOMBIE
+
+    eventually(is_gone, what="the end of the process that draws")

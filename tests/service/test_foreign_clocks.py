@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,19 @@ def test_a_leader_whose_clock_is_an_hour_off_is_replaced_when_it_dies(
     database.close()
 
 
+def is_stopped_without_lock(leader: subprocess.Popen[bytes], file: Path) -> bool:
+    """Stop it; where it holds SQLite's lock, let it go on: whoever is stopped with that keeps all others waiting."""
+    leader.send_signal(signal.SIGSTOP)
+    with closing(sqlite3.connect(file, timeout=2.0, isolation_level=None)) as other:
+        try:
+            other.execute("BEGIN IMMEDIATE")
+            other.execute("ROLLBACK")
+        except sqlite3.OperationalError:
+            leader.send_signal(signal.SIGCONT)
+            return False
+    return True
+
+
 def test_a_leader_that_was_stopped_and_goes_on_is_fenced_and_ends(sqlite_url: str, start: Start) -> None:
     database = Database(sqlite_url)
     leadership, grids = Leadership(database, TTL_S), GridStore(database)
@@ -98,7 +113,7 @@ def test_a_leader_that_was_stopped_and_goes_on_is_fenced_and_ends(sqlite_url: st
     standby = start(-1.0)
     grid_id = submit(grids, 40)
     eventually(lambda: grids.grid(grid_id).counts.done >= 2, what="results")
-    first.send_signal(signal.SIGSTOP)
+    eventually(lambda: is_stopped_without_lock(first, Path(sqlite_url.removeprefix("sqlite:///"))), what="a moment")
     eventually(lambda: leadership.alive() is None or leads(standby, leadership), what="a leader that is silent")
     eventually(lambda: leads(standby, leadership), what="the standby")
     first.send_signal(signal.SIGCONT)

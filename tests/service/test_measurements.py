@@ -235,12 +235,13 @@ def test_what_is_no_fits_file_or_does_not_fit_together_is_refused_at_the_door(
     assert api.get(ADDRESS).json()["items"] == []
 
 
+@pytest.mark.parametrize("url", [pytest.param("postgresql", marks=pytest.mark.postgres)], indirect=True)
 def test_an_image_is_measured_by_the_workers_of_a_service(url: str, tmp_path: Path, files: dict[str, bytes]) -> None:
     """From the upload to the answer, by real processes."""
     import httpx
 
     with (
-        serving(tmp_path, HOSTLENS_DATABASE_URL=url) as service,
+        serving(tmp_path, HOSTLENS_DATABASE_URL=url, HOSTLENS_WORKERS="1") as service,
         httpx.Client(base_url=f"http://127.0.0.1:{service.port}", timeout=60) as http,
     ):
         answer = http.post(ADDRESS, files=parts(files, "image", "noise", "psf"), data=KNOWN)

@@ -34,7 +34,7 @@ from tests.service.plans import result_of, submit
 from tests.service.service_process import ROOT
 
 
-@pytest.fixture(params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
+@pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
 def backend(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
@@ -60,15 +60,18 @@ def empties(backend: str, request: pytest.FixtureRequest, tmp_path: Path) -> Emp
     return Empties(backend, tmp_path, request.getfixturevalue("postgres_server") if backend == "postgresql" else None)
 
 
-@pytest.fixture
-def lived(empties: Empties) -> history.Rows:
+@pytest.fixture(scope="module")
+def lived(backend: str, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> history.Rows:
     """What a service of today leaves in its database."""
-    url = empties()
+    server = request.getfixturevalue("postgres_server") if backend == "postgresql" else None
+    url = Empties(backend, tmp_path_factory.mktemp("lived"), server)()
     upgrade(url)
     database = Database(url, pooled=False)
     history.live(database)
     with database.read() as connection:
-        return history.typed(connection)
+        rows = history.typed(connection)
+    database.close()
+    return rows
 
 
 def test_the_tree_is_one_line() -> None:

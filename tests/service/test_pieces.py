@@ -21,11 +21,12 @@ from service.runtime.settings import Settings
 from service.store import pieces, settling, submission
 from service.store.database import Database
 from service.store.depth import QueueDepth
-from service.store.grids import GridStore, NotFoundError
+from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.leases import Outcome
 from service.store.outbox import EventStore
 from service.store.queue import Failure, RunQueue
+from service.store.runs import NotFoundError
 from service.store.submission import SubmissionLostError
 from service.store.tables import grid, idempotency, run
 from service.store.upkeep import PATIENCE_S, Upkeep

@@ -20,10 +20,11 @@ from service.domain.states import GridState, RunState
 from service.store import leases as leases_module
 from service.store import queue as queue_module
 from service.store.database import Database
-from service.store.grids import GridStore, KeyReusedError, NotFoundError
+from service.store.grids import GridStore, KeyReusedError
 from service.store.leadership import Leadership, LeadershipLostError, require_generation
 from service.store.leases import Lease, Outcome, end_attempts, leased_by
 from service.store.queue import Failure, RunQueue, Stored
+from service.store.runs import NotFoundError
 from service.store.tables import event, leader, result, run
 from tests.service.conftest import Clock, empty
 from tests.service.plans import body, planned, result_of, submit

@@ -13,12 +13,13 @@ from service.domain.states import RunState
 from service.runtime.settings import Settings
 from service.store import grids as grids_module
 from service.store.database import Database
-from service.store.grids import GridStore, NotFoundError
+from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.leases import Outcome
 from service.store.queue import Failure, RunQueue
 from service.store.result_filter import ResultFilter
 from service.store.run_filter import RunFilter
+from service.store.runs import NotFoundError
 
 BODY = {"preset": "h0licow-vi", "n": [2, 4], "r_eff": [0.39], "l_eta": [1.0]}
 

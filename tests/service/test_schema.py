@@ -6,10 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 import schemathesis
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import HealthCheck, Phase, given, reject, settings
 from hypothesis.errors import Unsatisfiable
+from hypothesis.strategies import DrawFn, composite
 from schemathesis.checks import not_a_server_error
 from schemathesis.generation import GenerationMode
+from schemathesis.schemas import APIOperation
 from schemathesis.specs.openapi.checks import (
     content_type_conformance,
     response_schema_conformance,
@@ -31,6 +33,8 @@ from tests.service.test_api import TestClient, work
 
 HEADER = b"".join(card.ljust(80) for card in (b"SIMPLE  =                    T", b"END")).ljust(2880)
 """A FITS file as far as anybody looks who is no worker."""
+PATIENCE_S = 120
+"""For an answer: a file of all estimators' columns takes a second of CPU, and more of a busy machine's."""
 CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
 
 
@@ -91,6 +95,20 @@ CASES = settings(
 )
 
 
+@composite
+def cases(draw: DrawFn, operation: APIOperation, mode: GenerationMode) -> schemathesis.Case:
+    """Cases of an operation, without those that Schemathesis fails to make.
+
+    What it makes of the schema of a file it cannot check against that schema itself, now and then.
+    """
+    try:
+        return draw(operation.as_strategy(generation_mode=mode))
+    except ValueError as error:
+        if str(error) != "Unsupported type: 'Binary'":
+            raise
+        return reject()
+
+
 @pytest.mark.parametrize(("each", "least"), [(5, 80), pytest.param(120, 2000, marks=pytest.mark.long)])
 @pytest.mark.parametrize("mode", list(GenerationMode))
 def test_no_request_that_fits_or_breaks_the_schema_gives_a_5xx(
@@ -101,7 +119,7 @@ def test_no_request_that_fits_or_breaks_the_schema_gives_a_5xx(
         operation = found.ok()
 
         @settings(CASES, max_examples=each)
-        @given(case=operation.as_strategy(generation_mode=mode))
+        @given(case=cases(operation, mode))
         def try_it(case: schemathesis.Case) -> None:
             nonlocal tried
             tried += 1
@@ -110,7 +128,7 @@ def test_no_request_that_fits_or_breaks_the_schema_gives_a_5xx(
                     # What is there is not waited for: nothing will happen to it.
                     case.query = {key: value for key, value in (case.query or {}).items() if key != "wait"}
                     case.path_parameters[name] = KNOWN[name][tried // 2 % len(KNOWN[name])]
-            case.call_and_validate(checks=CHECKS)
+            case.call_and_validate(checks=CHECKS, timeout=PATIENCE_S)
 
         try:
             try_it()

@@ -272,6 +272,35 @@ def test_what_changes_anything_is_taken_from_no_page_of_another_site(
             assert api.post("/v1/grids", json=body(1), headers={**headers, **bearing(made)}).status_code == 202
 
 
+@pytest.mark.parametrize(
+    ("called", "status"),
+    [
+        ("localhost", 200), ("LOCALHOST:8421", 200), ("a.localhost", 200), ("127.1.2.3:1", 200), ("[::1]:8421", 200),
+        ("evil.example", 421), ("localhost.evil.example:8421", 421), ("192.0.2.1", 421), ("[2001:db8::1]", 421),
+        ("[::1", 421), ("lens.example.org", 421), ("observatory:8421", 200),
+    ],
+)  # fmt: skip
+def test_a_name_that_was_made_to_lead_to_loopback_leads_to_nothing(
+    settings: Settings, called: str, status: int
+) -> None:
+    # As a browser does whose page has another site's name, which that site points at 127.0.0.1: same-origin to both.
+    open_settings = settings.model_copy(update={"host": "127.0.0.1", "allowed_hosts": []})
+    headers = {"Host": called, "Sec-Fetch-Site": "same-origin"}
+    with TestClient(create_app(open_settings)) as api:
+        assert api.get("/v1/grids", headers=headers).status_code == status
+        made = api.post("/v1/grids", json=body(1), headers=headers)
+        assert made.status_code == (202 if status == 200 else 421)
+        if status == 421:
+            assert_problem(made, 421)
+    named = open_settings.model_copy(update={"allowed_hosts": ["Lens.example.org"]})
+    with TestClient(create_app(named)) as api:
+        wanted = 200 if called == "lens.example.org" else status
+        assert api.get("/v1/grids", headers=headers).status_code == wanted
+    # Who asks for tokens is called as anybody likes, unless told otherwise: a foreign page has none.
+    with TestClient(create_app(open_settings.model_copy(update={"auth": "tokens"}))) as api:
+        assert api.get("/v1/grids", headers=headers).status_code == 401
+
+
 def test_a_token_is_in_no_answer_and_no_log(
     api: TestClient, store: TokenStore, caplog: pytest.LogCaptureFixture
 ) -> None:

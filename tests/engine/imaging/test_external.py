@@ -141,7 +141,7 @@ def test_a_psf_without_a_smooth_peak_is_refused_for_a_peak_and_taken_by_pixel():
         recentred_psf(np.full((3, 3), np.inf), "centroid")
 
 
-@pytest.mark.parametrize("system", ["HE0435", "HS2209", "RXJ1131"])
+@pytest.mark.parametrize("system", ["HE0435", "HS2209", pytest.param("RXJ1131", marks=pytest.mark.long)])
 def test_a_noise_map_made_from_an_image_agrees_with_the_one_that_the_simulation_knows(system):
     # Handbook noise is sky, dark, read noise and Poisson, as the map assumes. The sky of a full cutout is known to
     # 15 % (the wings of the deflector are in it); in the arc, Poisson noise counts and the drizzle's correlation
