@@ -18,6 +18,7 @@ _BIN_BITS = 5
 _SHIFT = np.uint64(52 - _BIN_BITS)
 _REMAINDER = np.uint64(2 ** (52 - _BIN_BITS) - 1)
 _BIN_WIDTH = 0.5 ** (52 - _BIN_BITS)
+_EXPONENT = np.uint64(0x7FF << 52)
 
 _LOWEST_OCTAVE, _HIGHEST_OCTAVE = -64, 32
 _Z_LOW = 2.0**_LOWEST_OCTAVE
@@ -49,6 +50,25 @@ def look_up(z: float, table: FloatArray) -> float:
     t = np.float64(bits & _REMAINDER) * _BIN_WIDTH
     value: float = max(table[k, 0] + t * (table[k, 1] + t * (table[k, 2] + t * table[k, 3])), 0.0)
     return value
+
+
+@inlined_kernel
+def look_up_derivatives(z: float, table: FloatArray, by_n: FloatArray) -> tuple[float, float, float]:
+    """Surface brightness at z, its derivative by z, and the value there of another table with the same bins.
+
+    The derivative is that of the cubic, good to 1e-5 of the slope; where the brightness is constant it is zero.
+    """
+    inside = z if z < _Z_HIGH else _Z_HIGH
+    lifted = max(inside, _Z_LOW)
+    bits = np.uint64(np.float64(lifted).view(np.int64))
+    k = (bits >> _SHIFT) - _FIRST_BIN
+    t = np.float64(bits & _REMAINDER) * _BIN_WIDTH
+    value = table[k, 0] + t * (table[k, 1] + t * (table[k, 2] + t * table[k, 3]))
+    # An octave begins at the power of two below z, and has 2^5 bins.
+    width = np.uint64(bits & _EXPONENT).view(np.float64) * 0.5**_BIN_BITS
+    slope = (table[k, 1] + t * (2.0 * table[k, 2] + t * 3.0 * table[k, 3])) / width if lifted == z else 0.0
+    other = by_n[k, 0] + t * (by_n[k, 1] + t * (by_n[k, 2] + t * by_n[k, 3]))
+    return max(value, 0.0), slope, other
 
 
 @kernel

@@ -9,8 +9,8 @@ the ray tracer works on long arrays.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,10 +39,42 @@ _W3_CENTRE, _W3_SIDE = 4.0 / 9.0, 5.0 / 18.0
 _BATCH = 1024
 """Cells integrated together: their rays stay in the cache."""
 
+NODES = 9
+"""Of the 3 x 3 rule, whose weights are :data:`WEIGHTS`."""
+
 # Nodes of the 3 x 3 rule row by row, then of the 2 x 2 rule, in units of half a side.
-_NODE_X = np.array([-_G3, 0.0, _G3] * 3 + [-_G2, _G2] * 2)
-_NODE_Y = np.array([-_G3] * 3 + [0.0] * 3 + [_G3] * 3 + [-_G2] * 2 + [_G2] * 2)
-_WEIGHTS = np.outer([_W3_SIDE, _W3_CENTRE, _W3_SIDE], [_W3_SIDE, _W3_CENTRE, _W3_SIDE]).ravel()
+NODE_X = np.array([-_G3, 0.0, _G3] * 3 + [-_G2, _G2] * 2)
+NODE_Y = np.array([-_G3] * 3 + [0.0] * 3 + [_G3] * 3 + [-_G2] * 2 + [_G2] * 2)
+WEIGHTS = np.outer([_W3_SIDE, _W3_CENTRE, _W3_SIDE], [_W3_SIDE, _W3_CENTRE, _W3_SIDE]).ravel()
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """The cells that pixels were cut into: centres (n,), half a side (n,) [arcsec], and each one's pixel (n,)."""
+
+    x: FloatArray
+    y: FloatArray
+    half: FloatArray
+    owner: NDArray[np.int64]
+
+    def nodes(self) -> tuple[FloatArray, FloatArray]:
+        """Positions (9 n,) of the nodes of the 3 x 3 rule."""
+        x = self.x[:, None] + np.multiply.outer(self.half, NODE_X[:NODES])
+        y = self.y[:, None] + np.multiply.outer(self.half, NODE_Y[:NODES])
+        return x.ravel(), y.ravel()
+
+    def of(self, pixels: NDArray[np.intp]) -> Leaves:
+        """The same cells, with their pixels known by other numbers."""
+        return replace(self, owner=pixels[self.owner])
+
+
+def joined(parts: Sequence[Leaves]) -> Leaves:
+    """All cells of some renderings."""
+    if not parts:
+        nothing = np.empty(0)
+        return Leaves(nothing, nothing, nothing, nothing.astype(np.int64))
+    columns = [[getattr(part, field.name) for part in parts] for field in fields(Leaves)]
+    return Leaves(*(np.concatenate(column) for column in columns))
 
 
 @dataclass(frozen=True)
@@ -55,7 +87,7 @@ class _Cells:
 
     def nodes(self, part: slice, half: float) -> tuple[FloatArray, FloatArray]:
         """Positions (13 n,) of the nodes of both rules for n of the cells."""
-        return np.add.outer(self.x[part], half * _NODE_X).ravel(), np.add.outer(self.y[part], half * _NODE_Y).ravel()
+        return np.add.outer(self.x[part], half * NODE_X).ravel(), np.add.outer(self.y[part], half * NODE_Y).ravel()
 
     def split(self, chosen: NDArray[np.bool_], half: float) -> _Cells:
         """The four quarters of each chosen cell."""
@@ -121,7 +153,7 @@ def _judge(
     for start in range(0, n, _BATCH):
         part = slice(start, start + _BATCH)
         u, v = trace(*cells.nodes(part, half))
-        _integrate(u, v, (2.0 * half) ** 2, _WEIGHTS, table, flux[part], certain[part], error[part], smooth[part])
+        _integrate(u, v, (2.0 * half) ** 2, WEIGHTS, table, flux[part], certain[part], error[part], smooth[part])
     return flux, certain, error, smooth
 
 
@@ -134,14 +166,15 @@ def refine_pixels(
     *,
     absolute: float = 0.0,
     relative: float = 0.0,
-) -> FloatArray:
-    """Flux (n,) of pixels with centres ``x``, ``y`` (n,) and given side [arcsec].
+) -> tuple[FloatArray, Leaves]:
+    """Flux (n,) of pixels with centres ``x``, ``y`` (n,) and given side [arcsec], and the cells they were cut into.
 
     The estimated error of each pixel is at most ``absolute``, or ``relative`` times the brightest of these pixels
     where that is more; ``trace`` and ``table`` are the profile's.
     """
     total = np.zeros(x.size)
     cells = _Cells(x, y, np.arange(x.size))
+    parts: list[Leaves] = []
     for depth in range(MAX_DEPTH + 1):
         half = side * 0.5 ** (depth + 1)
         flux, certain, error, smooth = _judge(cells, half, trace, table)
@@ -151,8 +184,11 @@ def refine_pixels(
         rough = error > limit * np.where(smooth, 0.5**depth, _CUSP_SHARE)
         if depth == MAX_DEPTH:
             rough[:] = False
-        total += np.bincount(cells.owner[~rough], weights=flux[~rough], minlength=x.size)
+        done = ~rough
+        owner = cells.owner[done]
+        total += np.bincount(owner, weights=flux[done], minlength=x.size)
+        parts.append(Leaves(cells.x[done], cells.y[done], np.full(owner.size, half), owner))
         if not rough.any():
             break
         cells = cells.split(rough, half)
-    return total
+    return total, joined(parts)

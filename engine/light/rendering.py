@@ -9,6 +9,7 @@ ray-traced surface brightness varies within a pixel or the cusp may lie between 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from engine.errors import SpecError
 from engine.lensing.power_law import PowerLawLens, lens_constants, trace_rays
 from engine.light.brightness_bounds import brightness_range, length
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
-from engine.light.refinement import Tracer, refine_pixels
+from engine.light.refinement import Leaves, Tracer, joined, refine_pixels
 from engine.light.sersic import SersicProfile, sersic_constants
 
 DEFAULT_TOLERANCE = 1e-4
@@ -31,7 +32,7 @@ MIN_TOLERANCE = 1e-8
 _CLEARANCE = 2.0
 """Distance of a pixel from the cusp in units of its size from which it may be trusted: the differences reach so far."""
 
-_HALO = 2
+HALO = 2
 """Pixels beyond the grid on each side that the differences need."""
 
 
@@ -62,7 +63,7 @@ def _average(
     """
     for j in range(mean.shape[0]):
         for i in range(mean.shape[1]):
-            r, c = j + _HALO, i + _HALO
+            r, c = j + HALO, i + HALO
             f0 = f[r, c]
             sides_x, sides_y = f[r, c - 1] + f[r, c + 1], f[r - 1, c] + f[r + 1, c]
             corners = f[r - 1, c - 1] + f[r - 1, c + 1] + f[r + 1, c - 1] + f[r + 1, c + 1]
@@ -117,11 +118,12 @@ def _sum_below(error: FloatArray, limit: float) -> float:
     return total
 
 
-def _axis_with_halo(centres: FloatArray, side: float, name: str) -> FloatArray:
+def axis_with_halo(centres: FloatArray, side: float, name: str) -> FloatArray:
+    """Centres of pixels with :data:`HALO` more on each side; a SpecError where they are not ``side`` apart."""
     step = math.copysign(side, centres[-1] - centres[0])
     if not np.allclose(np.diff(centres), step, rtol=0.0, atol=1e-6 * side):
         raise SpecError(name, centres, f"centres that are pixel_scale = {side} apart")
-    beyond = step * np.arange(1, _HALO + 1)
+    beyond = step * np.arange(1, HALO + 1)
     return np.concatenate([centres[0] - beyond[::-1], centres, centres[-1] + beyond])
 
 
@@ -129,13 +131,21 @@ def _first_pass(
     x: FloatArray, y: FloatArray, side: float, trace: Tracer, table: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Flux of each pixel from one ray a pixel, and an estimate of its error; both (ny, nx), for unit flux."""
-    columns, rows = _axis_with_halo(x, side, "x"), _axis_with_halo(y, side, "y")
+    columns, rows = axis_with_halo(x, side, "x"), axis_with_halo(y, side, "y")
     shape = (rows.size, columns.size)
     u, v = trace(np.tile(columns, rows.size), np.repeat(rows, columns.size))
     f = brightness(u, v, table)
     mean, error = np.empty((y.size, x.size)), np.empty((y.size, x.size))
     _average(u.reshape(shape), v.reshape(shape), f.reshape(shape), table, mean, error)
     return mean * side**2, np.asarray(_greatest_of_neighbours(error)) * side**2
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """Flux per pixel (ny, nx) [e-/s] of a profile, and the cells that those pixels were cut into that were refined."""
+
+    image: FloatArray
+    leaves: Leaves
 
 
 def render_sersic(
@@ -171,15 +181,31 @@ def render_sersic(
     SpecError
         Where the pixels are not ``pixel_scale`` apart, or the tolerance is below what the radial table can give.
     """
+    return rendered(profile, x, y, pixel_scale, lens, tolerance).image
+
+
+def rendered(
+    profile: SersicProfile,
+    x: FloatArray,
+    y: FloatArray,
+    pixel_scale: float,
+    lens: PowerLawLens | None,
+    tolerance: float,
+) -> Rendering:
+    """The same as :func:`render_sersic`, and how it was integrated, for :mod:`engine.light.derivatives`."""
     if not MIN_TOLERANCE <= tolerance < 1:
         raise SpecError("tolerance", tolerance, f"at least {MIN_TOLERANCE} and below 1")
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     trace, table = _tracer(profile, lens), tabulate(profile)
     image, error = _first_pass(x, y, pixel_scale, trace, table)
+    parts: list[Leaves] = []
 
     def refine(chosen: NDArray[np.intp], absolute: float, relative: float) -> None:
         j, i = np.unravel_index(chosen, image.shape)
-        image[j, i] = refine_pixels(x[i], y[j], pixel_scale, trace, table, absolute=absolute, relative=relative)
+        image[j, i], leaves = refine_pixels(
+            x[i], y[j], pixel_scale, trace, table, absolute=absolute, relative=relative
+        )  # fmt: skip
+        parts.append(leaves.of(chosen))
         error[j, i] = 0.0
 
     # The brightest pixel is the measure of all errors: first of all those that might be it, until one has proved to be.
@@ -196,7 +222,7 @@ def render_sersic(
     chosen = np.flatnonzero(error > limit)
     if chosen.size:
         refine(chosen, min(limit, allowed / chosen.size), 0.0)
-    return image * profile.flux
+    return Rendering(image * profile.flux, joined(parts))
 
 
 def sample_sersic(

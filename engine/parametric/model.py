@@ -8,7 +8,7 @@ interpolated at every ray by the same spline as at every AGN image.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from copy import copy
 from functools import lru_cache
 from types import MappingProxyType
@@ -21,16 +21,15 @@ from engine.imaging.observation import Observation
 from engine.imaging.optics.spline import place_spline, spline_coefficients
 from engine.imaging.optics.stamp_blur import StampBlur
 from engine.lensing.power_law import PowerLawLens
-from engine.light.rendering import render_sersic, sample_sersic
-from engine.light.sersic import SersicProfile, profile_of
+from engine.light.derivatives import LightDerivatives
+from engine.light.refinement import Leaves
+from engine.light.rendering import rendered, sample_sersic
+from engine.light.sersic import SHAPE, SersicProfile, profile_of
 from engine.parametric.constraints import constraints
 from engine.parametric.parameters import HOST_FLUX, ParameterSpace, lens_of
 from engine.spec.priors import LensParameterName, ParameterPrior
 
 RENDER_TOLERANCE = 1e-3
-_LIGHT_STEPS = (1e-3, 1e-3, 1e-4, 1e-4, 1e-4, 1e-4)
-_LENS_STEP, _EXACT_LENS_STEP = 1e-5, 1e-4
-"""Integrated light is known to a part in a thousand of its peak: its differences need the longer step."""
 _ANCHOR = 5e-4
 """Shift [arcsec] over which the difference of an AGN image from its stamp is taken for the same."""
 _OUTSIDE = 24
@@ -88,6 +87,9 @@ class ImageModel:
         self._anchors: dict[int, tuple[float, float, FloatArray]] = {}
         self._deflector = lru_cache(maxsize=4)(self._render_deflector)
         self._host = lru_cache(maxsize=4)(self._render_host)
+        # A search ends with the derivatives where the next one, or the covariance, begins.
+        self._deflector_slopes = lru_cache(maxsize=2)(self._deflector_derivatives)
+        self._host_slopes = lru_cache(maxsize=2)(self._host_derivatives)
 
     def _point(self, index: int, x: float, y: float) -> FloatArray:
         """Column of an AGN image. What the exposures make of it is remembered as long as it moves next to nothing."""
@@ -108,42 +110,68 @@ class ImageModel:
         image = place_spline(self._spline, self.shape, column, row, along=along)
         return np.asarray(image.ravel() * self.weight) / (1.0 if along is None else scale)
 
-    def _light(self, profile: SersicProfile, lens: PowerLawLens | None, *, exact: bool) -> FloatArray:
+    def _light(self, profile: SersicProfile, lens: PowerLawLens | None) -> tuple[FloatArray, Leaves | None]:
+        """Column of light, and the cells it was integrated over, None where it was sampled."""
         blur = self._outer if lens is None else self._inner
-        if exact:
-            fine = render_sersic(profile, blur.x, blur.y, blur.side, lens, RENDER_TOLERANCE)
-        else:
+        if not self.exact:
             fine = sample_sersic(profile, lens, blur.x, blur.y, blur.side)
-        return blur(fine, integrated=exact).ravel() * self.weight
+            return blur(fine, integrated=False).ravel() * self.weight, None
+        found = rendered(profile, blur.x, blur.y, blur.side, lens, RENDER_TOLERANCE)
+        return blur(found.image, integrated=True).ravel() * self.weight, found.leaves
 
-    def _render_deflector(self, *values: float) -> FloatArray:
-        return self._light(profile_of(values), None, exact=self.exact)
+    def _light_derivatives(
+        self, profile: SersicProfile, lens: PowerLawLens | None, leaves: Leaves | None
+    ) -> FloatArray:
+        """Derivatives (parameters, pixels) of a column of light, by the lens if there is one and the shape."""
+        blur = self._outer if lens is None else self._inner
+        moving = LightDerivatives(profile, lens, shear=self.space.shear)
+        if leaves is None:
+            fine = moving.sampled(blur.x, blur.y, blur.side)
+        else:
+            fine = moving.integrated(blur.x, blur.y, blur.side, leaves)
+        return blur(fine, integrated=self.exact).reshape(moving.size, -1) * self.weight
 
-    def _render_host(self, *values: float) -> FloatArray:
-        split = len(values) - 6
-        return self._light(profile_of(values[split:]), lens_of(values[:split]), exact=self.exact)
+    def _render_deflector(self, *values: float) -> tuple[FloatArray, Leaves | None]:
+        return self._light(profile_of(values), None)
+
+    def _deflector_derivatives(self, *values: float) -> FloatArray:
+        return self._light_derivatives(profile_of(values), None, self._deflector(*values)[1])
+
+    def _render_host(self, *values: float) -> tuple[FloatArray, Leaves | None]:
+        split = len(values) - len(SHAPE)
+        return self._light(profile_of(values[split:]), lens_of(values[:split]))
+
+    def _host_derivatives(self, *values: float) -> FloatArray:
+        split = len(values) - len(SHAPE)
+        return self._light_derivatives(profile_of(values[split:]), lens_of(values[:split]), self._host(*values)[1])
 
     def corrected(self, values: FloatArray) -> ImageModel:
         """The model of data less what its columns of deflector and host lack of their exact images.
 
         A fit of the columns to these data is one with exact columns, as far as their error does not change with the
-        parameters (defect correction): ``values`` should lie near the solution.
+        parameters (defect correction): ``values`` should lie near the solution. AGN images begin exactly there.
         """
         space = self.space
         amplitudes, _, _ = self.amplitudes(values)
         lens, host = values[space.lens_slice], values[space.host_slice]
         lit: list[tuple[SersicProfile, PowerLawLens | None, float, FloatArray]] = [
-            (profile_of(host), lens_of(lens), float(amplitudes[HOST_FLUX]), self._host(*lens.tolist(), *host.tolist()))
+            (
+                profile_of(host),
+                lens_of(lens),
+                float(amplitudes[HOST_FLUX]),
+                self._host(*values[space.lens_slice.start :].tolist())[0],
+            )
         ]
         if space.deflector:
             shape = values[space.deflector_slice]
-            lit.append((profile_of(shape), None, float(amplitudes[space.n_agn]), self._deflector(*shape.tolist())))
+            lit.append((profile_of(shape), None, float(amplitudes[space.n_agn]), self._deflector(*shape.tolist())[0]))
         defect = np.zeros(self.data.size)
         for profile, behind, brightness, column in lit:
             exact = self.observation.optics.sersic_image(profile, behind)[self.window]
             defect += brightness * (exact.ravel() * self.weight - column)
         out = copy(self)
         out.data = self._observed - defect
+        out._anchors = {}
         return out
 
     def columns(self, values: FloatArray) -> FloatArray:
@@ -151,8 +179,8 @@ class ImageModel:
         space = self.space
         out = [self._point(k, float(x), float(y)) for k, (x, y) in enumerate(space.agn(values))]
         if space.deflector:
-            out.append(self._deflector(*values[space.deflector_slice].tolist()))
-        out.append(self._host(*values[space.lens_slice].tolist(), *values[space.host_slice].tolist()))
+            out.append(self._deflector(*values[space.deflector_slice].tolist())[0])
+        out.append(self._host(*values[space.lens_slice.start :].tolist())[0])
         out.append(self.weight)
         return np.stack(out, axis=1)
 
@@ -177,14 +205,13 @@ class ImageModel:
         """Whitened residuals of the image, followed by :func:`~engine.parametric.constraints.constraints`."""
         return np.concatenate([self.amplitudes(values)[1], constraints(self.space, values, self.priors)])
 
-    def jacobian(self, values: FloatArray, *, integrated: bool = False) -> FloatArray:
-        """Derivatives of :meth:`residuals`, by differences of samples of the light or of its integrals.
+    def jacobian(self, values: FloatArray) -> FloatArray:
+        """Derivatives of :meth:`residuals`: of integrals of the light where the model is ``exact``, else of samples.
 
-        Samples cost a fifth. They are wrong by a tenth where a cusp is magnified, and always in the same sense: a fit
-        may end where their gradient vanishes and that of chi^2 does not.
+        At values whose light has been rendered nothing is rendered again.
         """
         best, _, columns = self.amplitudes(values)
-        moved = self._column_derivatives(values, best, integrated=integrated)
+        moved = self._column_derivatives(values, best)
         basis, _ = np.linalg.qr(columns)
         moved -= basis @ (basis.T @ moved)
         return np.concatenate([-moved, _differences(lambda v: constraints(self.space, v, self.priors), values, 1e-6)])
@@ -193,11 +220,11 @@ class ImageModel:
         """Derivatives (rows, parameters + amplitudes) of data and constraints by all parameters; the amplitudes."""
         best, _, columns = self.amplitudes(values)
         rows = _differences(lambda v: constraints(self.space, v, self.priors), values, 1e-6)
-        top = np.concatenate([self._column_derivatives(values, best, integrated=self.exact), columns], axis=1)
+        top = np.concatenate([self._column_derivatives(values, best), columns], axis=1)
         below = np.concatenate([-rows, np.zeros((rows.shape[0], best.size))], axis=1)
         return np.concatenate([top, below]), best
 
-    def _column_derivatives(self, values: FloatArray, best: FloatArray, *, integrated: bool) -> FloatArray:
+    def _column_derivatives(self, values: FloatArray, best: FloatArray) -> FloatArray:
         """Change (pixels, parameters) of the whitened model with each nonlinear parameter."""
         space = self.space
         out = np.empty((self.data.size, space.size))
@@ -207,30 +234,9 @@ class ImageModel:
             out[:, 2 * k + 1] = best[k] * self._stamp(x, y, "row")
         if space.deflector:
             where = space.deflector_slice
-            out[:, where] = best[space.n_agn] * self._slopes(
-                lambda v: self._light(profile_of(v), None, exact=integrated), values[where], _LIGHT_STEPS
-            )
-        lens_values, host_values = values[space.lens_slice], values[space.host_slice]
-        lens, host = lens_of(lens_values), profile_of(host_values)
-        flux = best[HOST_FLUX]
-        out[:, space.lens_slice] = flux * self._slopes(
-            lambda v: self._light(host, lens_of(v), exact=integrated),
-            lens_values,
-            (_EXACT_LENS_STEP if integrated else _LENS_STEP,) * lens_values.size,
-        )
-        out[:, space.host_slice] = flux * self._slopes(
-            lambda v: self._light(profile_of(v), lens, exact=integrated), host_values, _LIGHT_STEPS
-        )
-        return out
-
-    @staticmethod
-    def _slopes(render: Callable[[FloatArray], FloatArray], values: FloatArray, steps: Sequence[float]) -> FloatArray:
-        here = render(values)
-        out = np.empty((here.size, values.size))
-        for k, step in enumerate(steps):
-            shifted = values.copy()
-            shifted[k] += step
-            out[:, k] = (render(shifted) - here) / step
+            out[:, where] = best[space.n_agn] * self._deflector_slopes(*values[where].tolist()).T
+        where = slice(space.lens_slice.start, space.size)
+        out[:, where] = best[HOST_FLUX] * self._host_slopes(*values[where].tolist()).T
         return out
 
 

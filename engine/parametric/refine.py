@@ -17,15 +17,11 @@ from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.residual_noise import measured_stamp_error, noise_scale
 from engine.parametric.search import Task, agn_light
-from engine.parametric.solution import INTEGRATED_STEPS, TOLERANCE, Solution, minimise
+from engine.parametric.solution import NEAR_STEPS, TOLERANCE, Solution, minimise
 from engine.parametric.uncertainty import parameter_covariance
 
 SUBRAYS = 2
 _STEPS = 40
-_SAMPLED_TOLERANCE = 1e-4
-"""Relative change of cost or parameters at which a fit with derivatives of samples ends."""
-_HOPELESS = 2.0
-"""Times what is acceptable from which on a fit is not worth the derivatives of integrated light."""
 _SHEAR_SHOWS = 4.0
 """Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
 
@@ -72,7 +68,10 @@ def polished(task: Task, solution: Solution) -> Solution:
     if task.shear is None and not _shear_shows(best):
         best = _full(task, best, best.model.sigma, shear=False)
     for _ in range(task.observation.optics.correction_rounds):
-        best = _again(best, best.model.corrected(best.values))
+        best = minimise(
+            best.model.corrected(best.values), best.start, best.values, NEAR_STEPS, TOLERANCE,
+            stamp_error=best.stamp_error,
+        )  # fmt: skip
     return best
 
 
@@ -83,20 +82,7 @@ def _full(task: Task, solution: Solution, sigma: FloatArray, *, shear: bool) -> 
     whole = slice(0, ny), slice(0, nx)
     model = ImageModel(task.observation, space, sigma, whole, subrays=SUBRAYS, exact=True, priors=task.priors)
     values = solution.space.with_shear(solution.values, shear=shear)
-    found = minimise(
-        model, solution.start, values, _STEPS, _SAMPLED_TOLERANCE, stamp_error=solution.stamp_error
-    )  # fmt: skip
-    if found.cost <= _HOPELESS * task.acceptance.chi2_per_dof * model.pixels:
-        return _again(found, model)
-    return found
-
-
-def _again(solution: Solution, model: ImageModel) -> Solution:
-    """The minimum of a model with derivatives of integrated light, from where another one was."""
-    return minimise(
-        model, solution.start, solution.values, INTEGRATED_STEPS, TOLERANCE, integrated=True,
-        stamp_error=solution.stamp_error,
-    )  # fmt: skip
+    return minimise(model, solution.start, values, _STEPS, TOLERANCE, stamp_error=solution.stamp_error)
 
 
 def _variances(task: Task, solution: Solution) -> tuple[FloatArray, FloatArray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -17,8 +16,9 @@ from engine.parametric.point_sources import Detection
 from engine.parametric.starts import Start
 
 TOLERANCE = 1e-6
-"""Relative change of cost or parameters at which a fit with derivatives of integrated light ends."""
-INTEGRATED_STEPS = 15
+"""Relative change of cost or parameters at which a fit of integrated light ends."""
+NEAR_STEPS = 15
+"""Of a fit that begins next to where another one ended."""
 _ROOM = 1e-6
 """How far inside its bounds a fit begins."""
 
@@ -90,19 +90,17 @@ def minimise(
     steps: int,
     tolerance: float,
     *,
-    integrated: bool = False,
     stamp_error: float = 1.0,
 ) -> Solution:
     """Least squares from ``values``, at most ``steps`` of them.
 
-    With ``integrated`` the derivatives are those of the integrated light, not of samples. A PosteriorError tells of a
-    component that puts no light on the image.
+    A PosteriorError tells of a component that puts no light on the image.
     """
     low, high = model.space.bounds(values, model.observation.pixel_scale, model.priors)
     fit = least_squares(
         model.residuals,
         np.clip(values, low + _ROOM, high - _ROOM),
-        partial(model.jacobian, integrated=integrated),
+        model.jacobian,
         (low, high),
         x_scale="jac",
         xtol=tolerance,
@@ -123,11 +121,11 @@ def minimise_held(solution: Solution, values: FloatArray, at: int, held: float) 
     fit = least_squares(
         lambda free: model.residuals(whole(free)),
         np.clip(np.delete(values, at), low + _ROOM, high - _ROOM),
-        lambda free: np.delete(model.jacobian(whole(free), integrated=True), at, axis=1),
+        lambda free: np.delete(model.jacobian(whole(free)), at, axis=1),
         (low, high),
         x_scale="jac",
         xtol=TOLERANCE,
         ftol=TOLERANCE,
-        max_nfev=INTEGRATED_STEPS,
+        max_nfev=NEAR_STEPS,
     )
     return replace(solution, values=whole(fit.x), cost=2.0 * float(fit.cost))

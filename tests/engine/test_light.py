@@ -123,7 +123,7 @@ def test_a_cell_is_integrated_by_the_nine_point_rule() -> None:
     nodes, weights = np.polynomial.legendre.leggauss(3)
     x, y = np.meshgrid(1.0 + 0.005 * nodes, 0.7 + 0.005 * nodes)
     expected = (surface_brightness(profile, x, y) * np.outer(weights, weights)).sum() * 0.005**2
-    ours = refinement.refine_pixels(
+    ours, _ = refinement.refine_pixels(
         np.array([1.0]), np.array([0.7]), 0.01, lambda a, b: to_profile_axes(a, b, light), table, absolute=1.0
     )
     assert ours[0] == pytest.approx(expected, rel=1e-6)

@@ -55,9 +55,18 @@ class StampBlur:
         self._sharper = self._kernel / smoothed
 
     def __call__(self, fine: FloatArray, *, integrated: bool) -> FloatArray:
-        """Image (ny, nx) of the window from the flux of each sub-pixel, integrated over it or sampled in its middle."""
-        laid = (self._deposit_x @ (self._deposit_y @ fine).T).T
-        kernel = self._sharper if integrated else self._kernel
-        blurred = fft.irfft2(fft.rfft2(laid, self._fft_shape) * kernel, self._fft_shape)
-        k, (ny, nx) = self._outside, self._shape
-        return np.asarray(blurred[k : k + ny, k : k + nx])
+        """Images (..., ny, nx) of the window from the flux of each sub-pixel (..., rows, columns).
+
+        That flux is integrated over the sub-pixel or sampled in its middle.
+        """
+        rows, columns = fine.shape[-2:]
+        across = (self._deposit_x @ fine.reshape(-1, columns).T).T.reshape(-1, rows, self._deposit_x.shape[0])
+        k, (ny, nx), (height, width) = self._outside, self._shape, self._fft_shape
+        out = np.empty((across.shape[0], ny, nx))
+        for m, image in enumerate(across):
+            # Along x only rows with light are transformed, and only those of the window are transformed back.
+            spectrum = fft.fft(fft.rfft(self._deposit_y @ image, width, axis=1), height, axis=0)
+            spectrum *= self._sharper if integrated else self._kernel
+            wanted = fft.ifft(spectrum, axis=0, overwrite_x=True)[k : k + ny]
+            out[m] = fft.irfft(wanted, width, axis=1)[:, k : k + nx]
+        return out.reshape(*fine.shape[:-2], ny, nx)
