@@ -94,10 +94,12 @@ if TYPE_CHECKING:
     )
     from engine.comparison import compare
     from engine.experiment import inspect_simulation, run
-    from engine.imaging.external import NoiseFromImage, observation_from_arrays
+    from engine.imaging.external import observation_from_arrays
     from engine.imaging.external_files import read_external_observation
     from engine.imaging.fits import read_observation, write_observation
+    from engine.imaging.noise_from_image import NoiseFromImage
     from engine.imaging.observation import Observation
+    from engine.imaging.readings import Reading, readings
     from engine.inspection import InversionView, inspect_inversion
     from engine.measure import ImageMeasurement, measure_image
     from engine.reconstruction import Reconstruction, analyse
@@ -114,10 +116,12 @@ else:
         ),
         "engine.comparison": "compare",
         "engine.experiment": "inspect_simulation run",
-        "engine.imaging.external": "NoiseFromImage observation_from_arrays",
+        "engine.imaging.external": "observation_from_arrays",
         "engine.imaging.external_files": "read_external_observation",
         "engine.imaging.fits": "read_observation write_observation",
+        "engine.imaging.noise_from_image": "NoiseFromImage",
         "engine.imaging.observation": "Observation",
+        "engine.imaging.readings": "Reading readings",
         "engine.inspection": "InversionView inspect_inversion",
         "engine.measure": "ImageMeasurement measure_image",
         "engine.reconstruction": "Reconstruction analyse",
@@ -187,6 +191,7 @@ __all__ = [
     "PullSummary",
     "Quantity",
     "Radii",
+    "Reading",
     "Realization",
     "Reconstruction",
     "Replicates",
@@ -235,6 +240,7 @@ __all__ = [
     "read_mapping",
     "read_observation",
     "read_system",
+    "readings",
     "realization_from_dict",
     "run",
     "serial_numbers",

@@ -4,8 +4,9 @@
 specifications use it.
 
 *Image frame*: x along increasing pixel columns, y along increasing pixel rows, arcsec, origin at the centre of the
-image; angles in radians counter-clockwise from +x. Images are North up, East left, so ``x_image = -x_East``. All
-numeric modules use it; :mod:`engine.simulation.scene` is the one place that converts.
+image; angles in radians counter-clockwise from +x. Our own images are North up, East left, so ``x_image = -x_East``;
+:class:`Orientation` says how anybody's stands on the sky. All numeric modules use the image frame;
+:mod:`engine.simulation.scene` converts into it, and :mod:`engine.on_sky` converts the answers back.
 
 Einstein radii and half-light radii are on the intermediate axis, ``R = sqrt(q x^2 + y^2 / q)`` with x along the major
 axis; magnitudes are AB; surface brightness is in e-/s per pixel.
@@ -14,6 +15,7 @@ axis; magnitudes are AB; surface brightness is in e-/s per pixel.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +37,37 @@ def image_angle(position_angle_deg: float) -> float:
 def position_angle(phi: float) -> float:
     """Position angle [deg East of North, in 0..180] of an image-frame angle [rad]."""
     return (math.degrees(phi) - 90.0) % 180.0
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """How an image stands on the sky.
+
+    Attributes
+    ----------
+    north
+        Image-frame angle of North [rad]; pi/2 where North is up.
+    mirrored
+        Whether East lies clockwise of North in the image, to the right where North is up.
+    """
+
+    north: float = math.pi / 2.0
+    mirrored: bool = False
+
+    def position_angle(self, phi: float) -> float:
+        """Position angle [deg East of North, in 0..180] of an axis at an image-frame angle [rad]."""
+        return math.degrees(self._from_north(phi)) % 180.0
+
+    def on_sky(self, x: float, y: float) -> tuple[float, float]:
+        """(East, North) [arcsec] of an image-frame position [arcsec]."""
+        angle, r = self._from_north(math.atan2(y, x)), math.hypot(x, y)
+        return r * math.sin(angle), r * math.cos(angle)
+
+    def _from_north(self, phi: float) -> float:
+        return self.north - phi if self.mirrored else phi - self.north
+
+
+NORTH_UP = Orientation()
 
 
 def sky_to_image(position: tuple[float, float]) -> tuple[float, float]:

@@ -18,9 +18,12 @@ from engine.digest import engine_digest, engine_versions
 from engine.errors import InversionError, ObservationError, PosteriorError, SpecError
 from engine.estimators.image import image_estimate
 from engine.imaging.observation import Observation
+from engine.imaging.readings import readings
+from engine.on_sky import lens_on_sky, orientation_document, places_on_sky, turned
 from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
+from engine.plausibility import require_hints, require_lens, unlikely
 from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit, undetected
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
@@ -140,6 +143,17 @@ class ImageMeasurement:
             "versions": self.versions,
             "engine_digest": self.engine_digest,
             "provenance": self.provenance,
+            "read": [asdict(reading) for reading in readings(self.observation)],
+            "on_sky": self._on_sky(),
+        }
+
+    def _on_sky(self) -> dict[str, Any]:
+        """Angles and positions East of North, however the image stands; the rest of the document has its frame."""
+        orientation = self.observation.orientation
+        return {
+            "image": orientation_document(orientation),
+            "lens": {name: _document(value) for name, value in lens_on_sky(self.lens, orientation).items()},
+            "agn": places_on_sky([(image.x, image.y) for image in self.agn], self.observation),
         }
 
 
@@ -181,6 +195,7 @@ def measure_image(
     positions: Sequence[tuple[float, float]] | None = None,
     seed: int = 0,
     inversion: bool = True,
+    trust_options: bool = False,
     progress: Progress | None = None,
 ) -> ImageMeasurement:
     """Measure the host galaxy in an observation.
@@ -203,6 +218,8 @@ def measure_image(
         For the chain.
     inversion : bool
         Whether to sample the inversion as well; the parametric fit alone takes seconds.
+    trust_options : bool
+        Go on, with a warning, where the observation cannot be one of a lens (:mod:`engine.plausibility`).
     progress : callable, optional
         Told each stage, and how far it is.
 
@@ -217,12 +234,15 @@ def measure_image(
     analysis = profile_analysis(profile, observation)
     if not 0 <= seed < 2**63:
         raise SpecError("seed", seed, "a whole number from 0 to 2^63 - 1")
+    require_hints(observation, theta_E, positions)
+    warnings = [*observation.notes, *unlikely(observation, trusting=trust_options)]
+    warnings += require_lens(observation, trusting=trust_options)
     rng = np.random.default_rng(seed)
     found = analyse(
         observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
         shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
     )  # fmt: skip
-    fit, warnings = found.fit, []
+    fit, orientation = found.fit, observation.orientation
     if inversion:
         try:
             found = analyse(observation, analysis, rng, fit=fit, progress=progress)
@@ -238,7 +258,7 @@ def measure_image(
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")
     # Where the map is too large the errors keep it: its excess stands for the noise that neighbouring pixels share.
     inflation = max(1.0, scale)
-    host = image_estimate(fit.hosts["wide"].inflated(inflation), "wide", observation.zero_point)
+    host = turned(image_estimate(fit.hosts["wide"].inflated(inflation), "wide", observation.zero_point), orientation)
     drawn = () if found.inversion is None else found.inversion.estimates
     warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
@@ -250,7 +270,7 @@ def measure_image(
     warnings += filter(None, (poor_fit(chi2), undetected(host)))
     return ImageMeasurement(
         host=host,
-        estimates=(host, *(estimate for estimate in drawn if estimate.index_prior == "wide")),
+        estimates=(host, *(turned(one, orientation) for one in drawn if one.index_prior == "wide")),
         lens=_by_name(lens_of_fit(fit, inflation)),
         lens_by_inversion=None if found.inversion is None else _by_name(found.inversion.lens),
         agn=tuple(

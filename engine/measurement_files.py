@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 from astropy.io import fits
 
+from engine.imaging.fits import world_coordinates
 from engine.measure import ImageMeasurement
 
 
 def write_measurement(path: str | Path, found: ImageMeasurement) -> None:
     """Write the image and, on the same pixels, MODEL, ARC (lensed host), RESIDUAL and SIGMA [e-/s] of the fit.
+
+    All have the world coordinates of the observation.
 
     SIGMA is infinite where a pixel was not fitted. The extension RESULT holds what
     :meth:`~engine.measure.ImageMeasurement.to_dict` says, as JSON text in one cell.
@@ -29,7 +32,8 @@ def write_measurement(path: str | Path, found: ImageMeasurement) -> None:
     primary.header["PIXSCALE"] = (observation.pixel_scale, "[arcsec] side of a pixel")
     primary.header["ZEROPNT"] = (observation.zero_point, "[mag] AB magnitude of 1 electron/s")
     primary.header["STATUS"] = found.status
-    hdus = [primary, *(fits.ImageHDU(values, name=name) for name, values in planes.items())]
+    world = world_coordinates(observation)
+    hdus = [primary, *(fits.ImageHDU(values, world, name=name) for name, values in planes.items())]
     for hdu in hdus[1:]:
         hdu.header["BUNIT"] = "electron/s"
     text = json.dumps(found.to_dict())

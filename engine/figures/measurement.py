@@ -93,7 +93,7 @@ def measurement_figure(found: ImageMeasurement) -> Figure:
     _bar(figure, axes[0, 0], shown, _DATA_UNIT)
     name_points(axes[0, 0], [(str(k + 1), agn.x, agn.y) for k, agn in enumerate(fit.agn)], half)
     scale_bar(axes[0, 0], half)
-    compass(axes[0, 0], half)
+    compass(axes[0, 0], half, orientation=observation.orientation)
     shown = _sky(axes[0, 1], fit.model, scale, norm, half, "parametric model")
     _bar(figure, axes[0, 1], shown, _DATA_UNIT)
     used = np.isfinite(fit.sigma)

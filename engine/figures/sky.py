@@ -12,7 +12,7 @@ from matplotlib.image import AxesImage
 from matplotlib.offsetbox import AnchoredText
 from matplotlib.patheffects import withStroke
 
-from engine.conventions import FloatArray
+from engine.conventions import NORTH_UP, FloatArray, Orientation
 
 _STROKE = [withStroke(linewidth=1.6, foreground="black", alpha=0.7)]
 _SIGMA_LINEAR = 3.0
@@ -65,10 +65,18 @@ def scale_bar(axes: Axes, half_width: float, *, fontsize: float = 8.0) -> None:
     )  # fmt: skip
 
 
-def compass(axes: Axes, half_width: float, *, fontsize: float = 8.0) -> None:
-    """Arrows to the North (up) and the East (left), at the lower right."""
-    x, y, length = 0.88 * half_width, -0.88 * half_width, 0.26 * half_width
-    for dx, dy, name in ((0.0, length, "N"), (-length, 0.0, "E")):
+def compass(axes: Axes, half_width: float, *, fontsize: float = 8.0, orientation: Orientation = NORTH_UP) -> None:
+    """Arrows to the North and the East, at the lower right: up and left, where the image is not turned."""
+    length = 0.26 * half_width
+    east = orientation.north + (-0.5 if orientation.mirrored else 0.5) * math.pi
+    arrows = [
+        (length * math.cos(angle), length * math.sin(angle), name)
+        for angle, name in ((orientation.north, "N"), (east, "E"))
+    ]
+    # Both arrows stay within the corner.
+    x = 0.88 * half_width - 1.3 * max(0.0, *(dx for dx, _, _ in arrows))
+    y = -0.88 * half_width - 1.3 * min(0.0, *(dy for _, dy, _ in arrows))
+    for dx, dy, name in arrows:
         axes.annotate(
             "", (x + dx, y + dy), (x, y),
             arrowprops={"arrowstyle": "-|>", "color": "white", "linewidth": 1.2, "shrinkA": 0, "shrinkB": 0},

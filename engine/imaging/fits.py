@@ -14,6 +14,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from scipy import sparse
 
+from engine.conventions import NORTH_UP, Orientation
 from engine.errors import ObservationError
 from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
@@ -28,10 +29,10 @@ _CARD_TEXT = 68
 def write_observation(path: str | Path, observation: Observation, *, overwrite: bool = False) -> None:
     """Write an Observation: extensions IMAGE, NOISE, PSF, VALID and, where it has them, COVARIANCE and EXPOSURES.
 
-    The image and its maps carry a tangential projection, North up and East left, where the observation knows its
-    ``centre``, and otherwise a linear system in arcsec from the centre, x increasing with the columns. The provenance
-    stands in the primary header: as JSON text in PKEYn and PVALn, which keeps every digit and the type, and for people
-    also under its own name where that is a FITS keyword and the value fits on a card.
+    The image and its maps carry a tangential projection, turned as its ``orientation`` says, where the observation
+    knows its ``centre``, and otherwise a linear system in arcsec from the centre, x increasing with the columns. The
+    provenance stands in the primary header: as JSON text in PKEYn and PVALn, which keeps every digit and the type, and
+    for people also under its own name where that is a FITS keyword and the value fits on a card.
     """
     primary = fits.PrimaryHDU()
     header = primary.header
@@ -39,7 +40,10 @@ def write_observation(path: str | Path, observation: Observation, *, overwrite: 
     header["HOSTLENS"] = (FORMAT_VERSION, "version of this layout")
     header["PIXSCALE"] = (observation.pixel_scale, "[arcsec] side of a pixel")
     header["ZEROPNT"] = (observation.zero_point, "[mag] AB magnitude of 1 electron/s")
-    exact = {"pixel_scale": observation.pixel_scale, "zero_point": observation.zero_point, "centre": observation.centre}
+    exact = {
+        "pixel_scale": observation.pixel_scale, "zero_point": observation.zero_point, "centre": observation.centre,
+        "orientation": asdict(observation.orientation), "notes": observation.notes,
+    }  # fmt: skip
     header["EXACT"] = json.dumps(exact)
     for key, value in observation.provenance.items():
         if _KEYWORD.fullmatch(key) and key not in header and key not in _RESERVED and _fits_on_a_card(value):
@@ -47,7 +51,7 @@ def write_observation(path: str | Path, observation: Observation, *, overwrite: 
     for index, (key, value) in enumerate(observation.provenance.items()):
         header[f"PKEY{index}"] = json.dumps(key)
         header[f"PVAL{index}"] = json.dumps(value)
-    world = _world_coordinates(observation)
+    world = world_coordinates(observation)
     planes: list[Any] = [
         fits.ImageHDU(observation.image, world, name="IMAGE"),
         fits.ImageHDU(observation.noise, world, name="NOISE"),
@@ -69,7 +73,8 @@ def _fits_on_a_card(value: str | float | int) -> bool:
     return math.isfinite(value) and abs(value) < 2**63
 
 
-def _world_coordinates(observation: Observation) -> fits.Header:
+def world_coordinates(observation: Observation) -> fits.Header:
+    """World coordinates of an observation's pixels, as :func:`write_observation` has them."""
     ny, nx = observation.shape
     world = WCS(naxis=2)
     world.wcs.crpix = [(nx + 1) / 2, (ny + 1) / 2]  # FITS counts pixels from 1
@@ -80,6 +85,10 @@ def _world_coordinates(observation: Observation) -> fits.Header:
         degrees = observation.pixel_scale / 3600
         world.wcs.ctype, world.wcs.cunit = ["RA---TAN", "DEC--TAN"], ["deg", "deg"]
         world.wcs.crval, world.wcs.cdelt = observation.centre, [-degrees, degrees]
+        if observation.orientation != NORTH_UP:
+            # One pixel along each axis, as steps to the East and the North.
+            (east_x, north_x), (east_y, north_y) = (observation.orientation.on_sky(*step) for step in ((1, 0), (0, 1)))
+            world.wcs.pc = [[-east_x, -east_y], [north_x, north_y]]
         world.wcs.radesys = "ICRS"
     return world.to_header()
 
@@ -165,4 +174,7 @@ def _observation(hdus: fits.HDUList) -> Observation:
         provenance=provenance,
         response=_response(hdus["EXPOSURES"]) if "EXPOSURES" in hdus else None,
         centre=None if exact["centre"] is None else (exact["centre"][0], exact["centre"][1]),
+        # Files of before have neither.
+        orientation=Orientation(**exact.get("orientation", {})),
+        notes=tuple(exact.get("notes", ())),
     )

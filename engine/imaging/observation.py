@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
+from astropy import units
+from astropy.nddata import NDData
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from engine.conventions import FloatArray
+from engine.conventions import NORTH_UP, FloatArray, Orientation
 from engine.errors import ObservationError
 from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.optics.interface import ImageOptics
@@ -26,7 +29,7 @@ class Observation:
     Attributes
     ----------
     image
-        (ny, nx) [e-/s per pixel], North up, East left.
+        (ny, nx) [e-/s per pixel].
     noise
         1 sigma of each pixel [e-/s], same shape; positive and finite where ``valid``.
     psf
@@ -47,6 +50,10 @@ class Observation:
         The exposures behind the image, where they are known: point sources are then exact, not shifted stamps.
     centre
         (RA, Dec) [deg, ICRS] of the middle of the image, where it is known.
+    orientation
+        How the image stands on the sky; North up and East left where nothing else is known.
+    notes
+        What was odd about it when it was read; a measurement repeats them as warnings.
     """
 
     image: FloatArray
@@ -59,6 +66,8 @@ class Observation:
     provenance: Provenance = field(default_factory=dict)
     response: ExposedOptics | None = None
     centre: tuple[float, float] | None = None
+    orientation: Orientation = NORTH_UP
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Copy, freeze and check; an ObservationError names what is wrong."""
@@ -89,6 +98,11 @@ class Observation:
                     f"centre: got {self.centre}, allowed are RA in [0, 360) and Dec in [-90, 90] deg"
                 )
             object.__setattr__(self, "centre", (ra, dec))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Rebuild from the fields, so that it can be pickled and copied: a read-only mapping cannot."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(self)}
+        return _rebuilt, (values | {"provenance": dict(self.provenance)},)
 
     def _check_image(self, valid: NDArray[np.bool_]) -> None:
         for name, array in (("noise", self.noise), ("valid", valid)):
@@ -134,8 +148,19 @@ class Observation:
         return self.optics.point_source(x, y)
 
 
+def _rebuilt(values: dict[str, Any]) -> Observation:
+    return Observation(**values)
+
+
 def image_array(name: str, values: ArrayLike) -> FloatArray:
-    """A read-only two-dimensional float64 copy; an ObservationError names what could not be one."""
+    """A read-only two-dimensional float64 copy; an ObservationError names what could not be one.
+
+    A mask or a unit would be lost here, so that arrays with one are refused:
+    :func:`~engine.imaging.external.observation_from_arrays` understands them.
+    """
+    masked = np.ma.getmaskarray(values).any() if isinstance(values, np.ma.MaskedArray) else False
+    if masked or isinstance(values, units.Quantity | NDData):
+        raise ObservationError(f"{name}: got a {type(values).__name__}, whose mask or unit would be lost")
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import tempfile
 from collections.abc import Callable
@@ -19,16 +18,17 @@ if TYPE_CHECKING:
     from engine import ImageMeasurement, Observation
 
 _DPI = 110
+_UNITS = ("e-/s", "e-", "count/s", "count", "DN/s", "DN", "MJy/sr")
 _SAID = {"parametric": "parametric fit"}
 """What is said of a stage of the engine; all the others are the inversion."""
 
 
 def measure(
     image: Annotated[Path, typer.Argument(help="FITS; one of `hostlens simulate` has noise map and PSF in it")],
-    noise: Annotated[Path | None, typer.Option(help="1 sigma map; made from the image without one")] = None,
+    noise: Annotated[Path | None, typer.Option(help="1 sigma map; the image's ERR, or made from it, without")] = None,
     psf: Annotated[Path | None, typer.Option(help="PSF on the image's pixels; any centre")] = None,
     pixel_scale: Annotated[float | None, typer.Option(help="arcsec; the image's header without")] = None,
-    zeropoint: Annotated[float | None, typer.Option(help="AB magnitude of 1 e-/s")] = None,
+    zeropoint: Annotated[float | None, typer.Option(help="AB magnitude of 1 e-/s; the image's header without")] = None,
     profile: Annotated[str, typer.Option(help="draft, standard or reference")] = "standard",
     json_file: Annotated[Path | None, typer.Option("--json", help="Where to write the result")] = None,
     figure: Annotated[Path | None, typer.Option(help="Where to draw it (PNG, PDF, SVG)")] = None,
@@ -41,12 +41,23 @@ def measure(
     ] = None,
     no_deflector: Annotated[bool, typer.Option("--no-deflector", help="The deflector does not shine")] = False,
     shear: Annotated[bool | None, typer.Option("--shear/--no-shear", help="External shear; the data decide")] = None,
-    unit: Annotated[str, typer.Option(help="Of image and noise map: e-/s or e-")] = "e-/s",
+    unit: Annotated[str | None, typer.Option(help=f"BUNIT, or e-/s, without; {', '.join(_UNITS)}")] = None,
     exposure: Annotated[float | None, typer.Option(help="Seconds; the image's EXPTIME without")] = None,
-    gain: Annotated[float, typer.Option(help="Electrons in a count of the image")] = 1.0,
-    saturation: Annotated[float | None, typer.Option(help="e-/s of a saturated pixel; without --noise only")] = None,
+    gain: Annotated[float | None, typer.Option(help="Electrons in a count of the image")] = None,
+    saturation: Annotated[float | None, typer.Option(help="e-/s of a saturated pixel")] = None,
     sky_rms: Annotated[float | None, typer.Option(help="e-/s of the empty sky's noise; without --noise only")] = None,
     mask: Annotated[Path | None, typer.Option(help="FITS, not zero where a pixel may be used")] = None,
+    psf_oversampling: Annotated[
+        int | None, typer.Option(help="How many times as finely as the image the PSF is sampled")
+    ] = None,
+    dq: Annotated[Path | None, typer.Option(help="FITS, flags of bad pixels; the image's DQ without")] = None,
+    good_bits: Annotated[str | None, typer.Option(help="Flags that do no harm, as 64,512 or WARM,HOT")] = None,
+    center: Annotated[tuple[str, str] | None, typer.Option(help="RA Dec to cut the image out by")] = None,
+    size: Annotated[float | None, typer.Option(help="Side of the cutout, arcsec")] = None,
+    extension: Annotated[str | None, typer.Option(help="Name or number of the image's plane, as SCI,2")] = None,
+    trust_options: Annotated[
+        bool, typer.Option("--trust-options", help="Options overrule a file that contradicts; doubts become warnings")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the chain")] = 0,
     inversion: Annotated[bool, typer.Option(help="Sample the inversion too; without it seconds")] = True,
 ) -> None:
@@ -54,56 +65,63 @@ def measure(
     if no_agn and (agn_images or positions):
         raise typer.BadParameter("--no-agn: there are --agn-images or --positions as well")
     outputs = [path for path in (json_file, figure, fits) if path is not None]
-    require_apart(outputs, [path for path in (image, noise, psf, mask) if path is not None])
+    inputs = [path for path in (image, noise, psf, mask, dq) if path is not None]
+    require_apart(outputs, inputs)
     for path, kinds in ((json_file, ()), (figure, PICTURES), (fits, FITS)):
         if path is not None:
             require_file(path, kinds)
-    require_readable(path for path in (image, noise, psf, mask) if path is not None)
+    require_readable(inputs)
     where = _positions(positions)
     with refusals():
         from rich.console import Console  # noqa: PLC0415 - help needs none
 
         observation = _observation(
-            image, noise, psf, pixel_scale, zeropoint,
-            mask=mask, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation, sky_rms_e_s=sky_rms,
+            image, psf, trust_options=trust_options, noise=noise, pixel_scale=pixel_scale, zero_point=zeropoint,
+            mask=mask, dq=dq, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation,
+            sky_rms_e_s=sky_rms, good_bits=good_bits, center=center, size=size, extension=extension,
+            psf_oversampling=psf_oversampling,
         )  # fmt: skip
-        from engine import measure_image  # noqa: PLC0415 - seconds, which only an image is worth
+        from engine import measure_image, readings  # noqa: PLC0415 - seconds, which only an image is worth
 
+        for reading in readings(observation):
+            typer.echo(f"read.{reading.name:12s} {_short(reading.value)}  ({reading.origin})")
         console = Console(stderr=True)
         with console.status("reading") as status:
             found = measure_image(
                 observation, profile=profile, agn_images=0 if no_agn else agn_images, deflector=not no_deflector,
                 shear=shear, theta_E=theta_e, positions=where, seed=seed, inversion=inversion,
-                progress=lambda stage, _: status.update(_SAID.get(stage, "inversion")),
+                trust_options=trust_options, progress=lambda stage, _: status.update(_SAID.get(stage, "inversion")),
             )  # fmt: skip
-        _write(found, json_file, figure, fits)
     for line in _summary(found):
         typer.echo(line)
     for warning in found.warnings:
         typer.echo(f"warning: {warning}", err=True)
+    failed = _write(found, json_file, figure, fits)
     for path in outputs:
-        typer.echo(path)
+        typer.echo(f"{path}: not written ({failed[path]})" if path in failed else path, err=path in failed)
+    if failed:
+        raise typer.Exit(1)
 
 
-def _observation(
-    image: Path, noise: Path | None, psf: Path | None, pixel_scale: float | None, zeropoint: float | None, **how: Any
-) -> Observation:
-    """Our own FITS file as it is, or anybody's from its parts."""
+def _short(value: str | float) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _observation(image: Path, psf: Path | None, *, trust_options: bool, **how: Any) -> Observation:
+    """Our own FITS file as it is, or anybody's from its parts; ``how`` is None where nothing is given."""
     if psf is None:
-        return _own_observation(image, (noise, pixel_scale, zeropoint))
-    if zeropoint is None or not math.isfinite(zeropoint):
-        raise typer.BadParameter("--zeropoint: the AB magnitude of 1 e-/s must be given")
-    if how["unit"] not in ("e-/s", "e-"):
-        raise typer.BadParameter(f"--unit: got {how['unit']!r}, allowed is e-/s or e-")
+        return _own_observation(image, [name for name, value in how.items() if value is not None])
+    if how["unit"] not in (None, *_UNITS):
+        raise typer.BadParameter(f"--unit: got {how['unit']!r}, allowed is one of {', '.join(_UNITS)}")
     from engine import read_external_observation  # noqa: PLC0415 - seconds, which only right options are worth
 
     return read_external_observation(
-        image, psf, zero_point=zeropoint, noise=noise, pixel_scale=pixel_scale, recentre_psf="pixel",
-        normalise_psf=True, **how,
-    )  # fmt: skip
+        image, psf, recentre_psf="pixel", normalise_psf=True, mend_psf=True, trust_options=trust_options, **how
+    )
 
 
-def _own_observation(image: Path, told: tuple[Path | float | None, ...]) -> Observation:
+def _own_observation(image: Path, told: list[str]) -> Observation:
+    """An observation of ours, of which nothing may be ``told``: parameters of the reader, as ``exposure_s``."""
     from astropy.io import fits  # noqa: PLC0415 - as the engine
 
     from engine import ObservationError  # noqa: PLC0415
@@ -116,8 +134,10 @@ def _own_observation(image: Path, told: tuple[Path | float | None, ...]) -> Obse
         raise ObservationError(f"{image}: not a FITS file that can be read ({error})") from error
     if not own:
         raise typer.BadParameter(f"--psf: {image} is not of `hostlens simulate`, so a PSF must be given")
-    if any(value is not None for value in told):
-        raise typer.BadParameter(f"{image} has noise map, pixel scale and zero point in it: leave them out")
+    if told:
+        plain = (name.replace("zero_point", "zeropoint").removesuffix("_e_s").removesuffix("_s") for name in told)
+        extra = ", ".join(f"--{name.replace('_', '-')}" for name in plain)
+        raise typer.BadParameter(f"{image} has its own noise map, PSF and zero point in it: leave out {extra}")
     from engine import read_observation  # noqa: PLC0415 - as above
 
     return read_observation(image)
@@ -136,20 +156,33 @@ def _positions(given: list[str] | None) -> list[tuple[float, float]] | None:
     return out
 
 
-def _write(found: ImageMeasurement, json_file: Path | None, figure: Path | None, fits: Path | None) -> None:
-    """Each file whole or not at all."""
-    if figure is not None:
+def _write(
+    found: ImageMeasurement, json_file: Path | None, figure: Path | None, fits: Path | None
+) -> dict[Path, Exception]:
+    """Each file whole or not at all; those that could not be written, and why: none takes another with it."""
+
+    def draw(path: Path) -> None:
         from engine.figures import measurement_figure  # noqa: PLC0415 - matplotlib takes a while
 
-        kind = figure.suffix.lower().removeprefix(".") or "png"
-        _whole(figure, lambda path: measurement_figure(found).savefig(path, dpi=_DPI, format=kind))
-    if fits is not None:
+        kind = (figure or path).suffix.lower().removeprefix(".") or "png"
+        measurement_figure(found).savefig(path, dpi=_DPI, format=kind)
+
+    def store(path: Path) -> None:
         from engine.measurement_files import write_measurement  # noqa: PLC0415 - as above
 
-        _whole(fits, lambda path: write_measurement(path, found))
-    if json_file is not None:
-        text = json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n"
-        _whole(json_file, lambda path: path.write_text(text, encoding="utf-8"))
+        write_measurement(path, found)
+
+    def tell(path: Path) -> None:
+        path.write_text(json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+    failed: dict[Path, Exception] = {}
+    for target, write in ((json_file, tell), (fits, store), (figure, draw)):
+        if target is not None:
+            try:
+                _whole(target, write)
+            except (OSError, ValueError, TypeError, RuntimeError, ArithmeticError, MemoryError) as error:
+                failed[target] = error
+    return failed
 
 
 def _whole(path: Path, write: Callable[[Path], Any]) -> None:

@@ -9,11 +9,16 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 from engine import PRINTABLE, spec_digest
 from service.domain.plan import IMAGE, PlannedRun
 
-FILES = ("image", "noise", "psf", "mask")
-_OF_OURS = ("pixel_scale", "zeropoint", "exposure", "saturation", "sky_rms")
+FILES = ("image", "noise", "psf", "mask", "dq")
+_OF_OURS = (
+    "pixel_scale", "zeropoint", "unit", "exposure", "gain", "saturation", "sky_rms", "good_bits", "center", "size",
+    "extension", "psf_oversampling",
+)  # fmt: skip
 """What an observation of ``hostlens simulate`` has in its own file."""
 
 Positive = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=PRINTABLE)]
+Place = Annotated[str, StringConstraints(max_length=80, pattern=r"^[^,\s][^,]*,[^,]*[^,\s]$")]
 Offset = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False)]
 
 
@@ -25,15 +30,29 @@ class MeasurementOptions(BaseModel):
     name: Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=PRINTABLE)] | None = None
     profile: Literal["draft", "standard", "reference"] = "standard"
     zeropoint: Annotated[float, Field(ge=-50.0, le=100.0)] | None = None
-    """AB magnitude of 1 e-/s."""
+    """AB magnitude of 1 e-/s; what the image's header says without."""
     pixel_scale: Positive | None = None
     """[arcsec]; that of the image's header without."""
-    unit: Literal["e-/s", "e-"] = "e-/s"
+    unit: Literal["e-/s", "e-", "count/s", "count", "DN/s", "DN", "MJy/sr"] | None = None
+    """The image's BUNIT without, and e-/s where it has none."""
     exposure: Positive | None = None
     """[s]; the image's EXPTIME without."""
-    gain: Positive = 1.0
+    gain: Positive | None = None
+    """Electrons in a count."""
     saturation: Positive | None = None
-    """[e-/s]; without a noise map only."""
+    """[e-/s]."""
+    good_bits: Text | None = None
+    """Flags that do no harm, as 64,512."""
+    psf_oversampling: Annotated[int, Field(ge=1, le=16)] | None = None
+    """How many times as finely as the image the PSF is sampled; what its own pixel scale says without."""
+    center: Place | None = None
+    """RA,Dec to cut the image out by, with ``size``."""
+    size: Positive | None = None
+    """Side of the cutout [arcsec]."""
+    extension: Text | None = None
+    """Name or number of the image's plane."""
+    trust_options: bool = False
+    """Options overrule files that contradict them."""
     sky_rms: Positive | None = None
     """[e-/s]; without a noise map only."""
     theta_e: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
@@ -71,8 +90,10 @@ def require_consistent(options: MeasurementOptions, files: set[str], *, is_own: 
         return
     if "psf" not in files:
         raise OptionError("psf", "missing; the image is not of hostlens simulate, so a PSF must be given")
-    if options.zeropoint is None:
-        raise OptionError("zeropoint", "missing; allowed is the AB magnitude of 1 e-/s")
+    if "noise" in files and options.sky_rms is not None:
+        raise OptionError("sky_rms", "the noise map has it already")
+    if options.center is not None and options.size is None:
+        raise OptionError("size", "missing; allowed is the side of the cutout [arcsec]")
 
 
 def planned_measurement(options: MeasurementOptions, uploads: dict[str, str]) -> PlannedRun:

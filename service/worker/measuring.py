@@ -51,6 +51,7 @@ def measure(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
             positions=[(x, y) for x, y in options["positions"]] or None,
             seed=options["seed"],
             inversion=options["inversion"],
+            trust_options=options["trust_options"],
         )
     payload = {
         "realization_digest": spec_digest(spec),
@@ -66,20 +67,29 @@ def measure(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
 def _observation(files: dict[str, Path], options: dict[str, Any]) -> Observation:
     if "psf" not in files:
         return read_observation(files["image"])
+    center = (options["center"] or "").partition(",")
     return read_external_observation(
         files["image"],
         files["psf"],
         zero_point=options["zeropoint"],
         noise=files.get("noise"),
         mask=files.get("mask"),
+        dq=files.get("dq"),
         pixel_scale=options["pixel_scale"],
         unit=options["unit"],
         exposure_s=options["exposure"],
         gain=options["gain"],
         saturation_e_s=options["saturation"],
         sky_rms_e_s=options["sky_rms"],
+        good_bits=options["good_bits"],
+        center=None if options["center"] is None else (center[0].strip(), center[2].strip()),
+        size=options["size"],
+        extension=options["extension"],
+        psf_oversampling=options["psf_oversampling"],
+        trust_options=options["trust_options"],
         recentre_psf="pixel",
         normalise_psf=True,
+        mend_psf=True,
     )
 
 

@@ -94,6 +94,9 @@ def test_the_result_is_plain_json_with_the_promised_fields(found: ImageMeasureme
         assert document["lens"][name]["sd"] > 0
     assert document["estimator"] == "parametric"
     assert document["estimator"] in [estimate["estimator"] for estimate in document["estimates"]]
+    # Names that exist stay: programs of other people read them.
+    for key in ("host", "agn", "lens", "arc_magnitude", "read", "on_sky"):
+        assert document[key], key
     for key in ("chi2_per_dof", "status", "seconds", "profile", "warnings", "versions", "engine_digest", "seed"):
         assert key in document
 

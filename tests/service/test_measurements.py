@@ -150,6 +150,36 @@ def test_what_the_engine_refuses_is_the_failure_of_the_run(
     assert (found["state"], found["error"]["code"]) == ("failed", "invalid_observation")
 
 
+@pytest.mark.parametrize("url", ["sqlite"], indirect=True)
+def test_an_upload_says_what_it_is_and_the_service_cuts_it_out(
+    api: TestClient, settings: Settings, files: dict[str, bytes]
+) -> None:
+    # Noise alone, which a worker refuses at once, once it has read all there is to read.
+    header = fits.Header({"BUNIT": "ELECTRONS", "EXPTIME": 100.0, "ABMAG": 25.5, "CRPIX1": 400.0, "CRPIX2": 400.0})
+    header.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 150.0, "CRVAL2": -2.0})
+    header.update({"CDELT1": -0.08 / 3600, "CDELT2": 0.08 / 3600})
+    data = io.BytesIO()
+    fits.writeto(data, np.random.default_rng(1).standard_normal((800, 800)).astype(np.float32), header)
+    image = {"image": ("i.fits", data.getvalue()), "psf": ("p.fits", files["psf"])}
+    for options, said in (
+        ({"center": "150.0,-2.0", "size": "5"}, "nothing stands out of its noise"),
+        ({}, "800 x 800 pixels"),
+        ({"size": "5", "unit": "e-/s"}, "--unit says e-/s"),
+        ({"size": "5", "unit": "e-/s", "trust_options": "true", "pixel_scale": "0"}, None),
+    ):
+        answer = api.post(ADDRESS, files=image, data=options)
+        if said is None:
+            assert_problem(answer, 422, "/pixel_scale")
+            continue
+        assert answer.status_code == 202, answer.text
+        database, lease = claimed(settings)
+        failure = measured(lease, settings)
+        assert isinstance(failure, Failure)
+        assert said in failure.detail
+        RunQueue(database).fail(lease, failure)
+        database.close()
+
+
 def test_the_same_key_and_files_are_one_measurement(api: TestClient, files: dict[str, bytes]) -> None:
     key = {"Idempotency-Key": "once"}
     first, again = (api.post(ADDRESS, files=parts({"image": files["own"]}, "image"), headers=key) for _ in range(2))
@@ -206,7 +236,11 @@ def test_what_is_no_fits_file_or_does_not_fit_together_is_refused_at_the_door(
         ({"image": ("x", b"SIMPLE  =                    T" + b" " * 5730), "psf": psf}, scale, "/image"),
         ({"image": image, "psf": ("x", files["psf"][:2000])}, scale, "/psf"),
         ({"image": image}, scale, "/psf"),
-        ({"image": image, "psf": psf}, {}, "/zeropoint"),
+        ({"image": image, "psf": psf, "noise": image}, {"sky_rms": "0.1"}, "/sky_rms"),
+        ({"image": image, "psf": psf}, {"center": "150,2"}, "/size"),
+        ({"image": image, "psf": psf}, {"center": "150", "size": "5"}, "/center"),
+        ({"image": image, "psf": psf}, {"unit": "furlong"}, "/unit"),
+        ({"image": own}, {"gain": "2"}, "/gain"),
         ({"image": own, "noise": image}, {}, "/noise"),
         ({"image": own}, scale, "/zeropoint"),
         ({"psf": psf}, scale, "/image"),
