@@ -24,7 +24,7 @@ from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
 from engine.plausibility import require_hints, require_lens, unlikely
-from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit_warning
+from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit, undetected
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
@@ -267,7 +267,7 @@ def measure_image(
     status: MeasurementStatus = "ok"
     if chi2 > POOR_FIT:
         status = "poor_fit"
-        warnings.append(poor_fit_warning(chi2))
+    warnings += filter(None, (poor_fit(chi2), undetected(host)))
     return ImageMeasurement(
         host=host,
         estimates=(host, *(turned(one, orientation) for one in drawn if one.index_prior == "wide")),

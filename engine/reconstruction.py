@@ -7,6 +7,7 @@ The part behind the parametric fit is left out where no estimator needs it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -43,6 +44,10 @@ from engine.stages import Progress, Stopwatch
 
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on it is said that the model does not describe the image."""
+DETECTED = 3.0
+"""Flux of a host in its own errors below which it is said that none was detected."""
+_BRIGHT_SIDE = 1.645
+"""Standard deviations that 95 % of a normal distribution are above."""
 
 
 @dataclass(frozen=True)
@@ -161,13 +166,32 @@ def analyse(
             if prior in fit.hosts
         )
     found = Reconstruction(observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings)
-    misfit = found.chi2 / found.degrees_of_freedom
-    return replace(found, warnings=(*warnings, poor_fit_warning(misfit))) if misfit > POOR_FIT else found
+    told = [
+        *warnings,
+        *(undetected(one) for one in estimates if one.estimator == "image" and one.index_prior == "wide"),
+    ]
+    told.append(poor_fit(found.chi2 / found.degrees_of_freedom))
+    return replace(found, warnings=tuple(filter(None, told)))
 
 
-def poor_fit_warning(misfit: float) -> str:
-    """What is said where ``misfit``, the chi2 per degree of freedom, exceeds :data:`POOR_FIT`."""
+def poor_fit(misfit: float) -> str:
+    """What is said of a chi2 per degree of freedom; nothing up to :data:`POOR_FIT`."""
+    if misfit <= POOR_FIT:
+        return ""
     return f"model: chi2 per degree of freedom is {misfit:.2f}; the errors do not cover what it misses"
+
+
+def undetected(host: Estimate) -> str:
+    """What is said of a host that the data do not show; nothing of one whose flux is :data:`DETECTED` errors.
+
+    A magnitude is that of a positive flux, however little of it there is: of such a host it says what the prior does.
+    """
+    significance = 2.5 / math.log(10.0) / host.magnitude.sd
+    if significance >= DETECTED:
+        return ""
+    limit = host.magnitude.mean - _BRIGHT_SIDE * host.magnitude.sd
+    told = f"its flux is {significance:.1f} times its error, {DETECTED:g} are a detection"
+    return f"host: not detected: {told}; fainter than {limit:.1f} mag (95 %)"
 
 
 def _priors(fixed_index: float | None) -> list[IndexPrior]:
