@@ -79,7 +79,7 @@ def drizzle_correlation(pixfrac: float, scale_ratio: float) -> float:
 
 def saturated_pixels(image: FloatArray, level: float | None) -> NDArray[np.bool_]:
     """Pixels (ny, nx) at ``level`` or above, and their eight neighbours; none where it is None."""
-    bright = np.zeros(image.shape, dtype=bool) if level is None else np.nan_to_num(image, nan=0.0) >= level
+    bright = np.zeros(image.shape, dtype=bool) if level is None else np.isfinite(image) & (image >= level)
     return np.asarray(ndimage.binary_dilation(bright, np.ones((3, 3), dtype=bool)) if bright.any() else bright)
 
 

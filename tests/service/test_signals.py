@@ -130,6 +130,20 @@ def test_a_command_that_is_stopped_says_that_its_work_is_not_done_and_leaves_nob
                 each.kill()
 
 
+def test_an_interrupt_while_a_dataclass_is_made_ends_a_command_like_any_other() -> None:
+    program = """
+import sys
+import service.__main__, service.cli.app
+def made():
+    exec("raise KeyboardInterrupt")
+service.cli.app.app = made
+sys.argv = ["hostlens", "demo"]
+service.__main__.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, check=False)
+    assert (ended.returncode, ended.stderr) == (128 + signal.SIGINT, b"")
+
+
 def test_the_handlers_are_there_before_anything_that_takes_time_to_load(tmp_path: Path) -> None:
     """All that a signal can still hit is Python's own start."""
     for command in SERVICES.values():
