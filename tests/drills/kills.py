@@ -149,6 +149,8 @@ class WorkerKills(Drill):
     every_s: float = 2.0
     sleep_s: float = 0.2
     workers: int = 4
+    most: int | None = None
+    """Kills at most; where None, as long as the grid lasts."""
 
     def run(self, ground: Ground) -> Report:
         """Kill one worker after the other, oldest first, until the grid has ended."""
@@ -164,7 +166,7 @@ class WorkerKills(Drill):
             grid = service.client.submit(body(self.runs))
 
             def kill() -> None:
-                while not stop.wait(self.every_s):
+                while len(kills) != self.most and not stop.wait(self.every_s):
                     while (ready := service.readiness()) is None or ready.workers < 2:
                         if stop.wait(0.1):
                             return
