@@ -37,6 +37,8 @@ _WHOLE = frozenset({"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss"})
 """Protocols where an object appears as a whole or not at all; to move one there is to copy it."""
 _UNSYNCABLE = frozenset({errno.EINVAL, errno.ENOTSUP})
 """What file systems say that keep no promise about folders."""
+_out_of_reach: set[Path] = set()
+"""Half-written files of this process in folders that were taken away."""
 _kept: ContextVar[dict[str, bytes] | None] = ContextVar("kept", default=None)
 
 
@@ -282,7 +284,10 @@ def _renew(path: Path, digest: str) -> bool:
 
 
 def _write_file(path: Path, pieces: Iterable[bytes]) -> None:
-    """Write a file beside its place, to the disk itself, then move it there; nothing is left where that fails."""
+    """Write a file beside its place, to the disk itself, then move it there; nothing is left where that fails.
+
+    Where the folder was taken away meanwhile, what lies in it half-written is removed with the next file.
+    """
     _make_folder(path.parent)
     beside = path.with_name(f"{path.name}.{uuid4().hex}.partial")
     try:
@@ -294,10 +299,21 @@ def _write_file(path: Path, pieces: Iterable[bytes]) -> None:
             path.rename(path.with_name(f"{path.name}.{uuid4().hex}.damaged"))
         beside.replace(path)
     except BaseException:
-        with suppress(OSError):
-            beside.unlink(missing_ok=True)
+        _remove(beside)
         raise
     _sync(path.parent)
+    for left in tuple(_out_of_reach):
+        _remove(left)
+
+
+def _remove(half_written: Path) -> None:
+    try:
+        half_written.unlink()
+    except OSError:
+        if not half_written.parent.is_dir():
+            _out_of_reach.add(half_written)
+            return
+    _out_of_reach.discard(half_written)
 
 
 def _make_folder(folder: Path) -> None:

@@ -155,7 +155,8 @@ class WorkerKills(Drill):
     def run(self, ground: Ground) -> Report:
         """Kill one worker after the other, oldest first, until the grid has ended."""
         calm = undisturbed(self.runs)
-        kills, stop = [], Event()
+        kills: list[int] = []
+        stop = Event()
         settings = {
             "HOSTLENS_DRILL_SLEEP": str(self.sleep_s),
             "HOSTLENS_WORKERS": str(self.workers),

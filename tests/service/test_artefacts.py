@@ -28,6 +28,7 @@ from service.dispatcher.outcomes import read_artefacts
 from service.dispatcher.telemetry import DispatcherMetrics
 from service.domain.payload import ArtefactPayload, InvalidResultError, ResultPayload, read_payload
 from service.runtime.settings import Settings
+from service.store import artefacts
 from service.store.artefacts import ArtefactDamagedError, ArtefactGoneError, ArtefactStore, ArtefactStoreError, keeping
 from service.store.database import Database
 from service.store.leadership import Leadership
@@ -479,6 +480,26 @@ def held(database: Database, folder: Path) -> Setting:
         setting.run(until=lambda: len(setting.dispatcher._backlog.leases) == 4)
         assert len(setting.dispatcher._backlog.leases) == 4
     return setting
+
+
+def test_what_was_half_written_when_its_folder_was_taken_away_is_removed_once_that_is_back(tmp_path: Path) -> None:
+    store, aside = tmp_path / "store", tmp_path / "aside"
+    first, second = ("ab" * 32 + ".png", "cd" * 32 + ".png")
+
+    def pieces() -> Iterator[bytes]:
+        yield b"half"
+        store.rename(aside)
+        store.touch()
+        yield b"of it"
+
+    with pytest.raises(OSError, match=r"Not a directory|No such file"):
+        artefacts._write_file(store / "ab" / first, pieces())
+    store.unlink()
+    aside.rename(store)
+    assert [path.suffix for path in store.rglob("*") if path.is_file()] == [".partial"]
+    artefacts._write_file(store / "cd" / second, [b"whole"])
+    assert [path.name for path in store.rglob("*") if path.is_file()] == [second]
+    assert not artefacts._out_of_reach
 
 
 def lease(number: int) -> Lease:
