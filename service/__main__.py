@@ -19,11 +19,11 @@ def main() -> None:
             start.interruptible()
         app()
     except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
+    finally:
         # CPython takes note of an interrupt in code that was compiled from a string, as dataclasses are made, and ends
         # by the signal whatever becomes of it; the next such code clears the note.
         exec("")  # noqa: S102 - an empty text
-        sys.exit(128 + signal.SIGINT)
-    finally:
         start.finish(service=bool(service))
 
 
