@@ -15,8 +15,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from engine.conventions import FloatArray
+from engine.errors import InversionError
 from engine.estimators.draws import source_draw
+from engine.estimators.error_budget import with_image_budget, with_source_budget
 from engine.estimators.image import image_estimate
+from engine.estimators.numerical_error import Answer, BestState, source_shifts
 from engine.estimators.refit import refit_draws
 from engine.estimators.sersic_fit import Refit
 from engine.estimators.summaries import summarise_all
@@ -161,7 +164,7 @@ def analyse(
         missing = [prior for prior in _priors(fixed_index) if prior not in fit.hosts]
         warnings += tuple(f"image estimator, n {prior}: no fit has a positive host" for prior in missing)
         estimates += tuple(
-            image_estimate(fit.hosts[prior], prior, observation.zero_point)
+            with_image_budget(image_estimate(fit.hosts[prior], prior, observation.zero_point), fit.shifts.get(prior))
             for prior in _priors(fixed_index)
             if prior in fit.hosts
         )
@@ -222,13 +225,21 @@ def _sample(
         states = chain.thinned(analysis.draws, rng)
         draws = [source_draw(target.invert(state), target.lens(state), rng) for state in states]
         flat = chain.flat()
-        best = target.invert(flat[int(np.argmax(chain.ln_posterior.ravel()))])
+        at_best = flat[int(np.argmax(chain.ln_posterior.ravel()))]
+        best = target.invert(at_best)
         image_plane, chi2 = inverted_image(observation, problem, best)
     with watch.stage("refit"):
         drawn = [name for name in analysis.estimators if name != "image"]
         refits = tuple(refit_draws(draws, drawn, fixed_index, rng))
         answers = summarise_all(draws, refits, observation.zero_point)
     warnings = list(answers.warnings)
+    shifts: dict[Answer, dict[str, FloatArray]] = {}
+    with watch.stage("errors"):
+        state = BestState(target.lens(at_best), float(at_best[-1]), best)
+        try:
+            shifts = source_shifts(observation, problem, target.source, state, analysis.psf_radius, drawn, fixed_index)
+        except InversionError as error:
+            warnings.append(f"numerical error: not predicted, on another source grid {error}")
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
@@ -248,7 +259,10 @@ def _sample(
         image_plane=image_plane,
         source_plane=inverted_source(best, flat, target.prior.names),
         refits=refits,
-        estimates=answers.estimates,
+        estimates=tuple(
+            with_source_budget(one, shifts.get((one.estimator, one.index_prior)), chain.summary.effective_samples)
+            for one in answers.estimates
+        ),
         aperture=answers.aperture,
         warnings=tuple(warnings),
     )

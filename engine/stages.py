@@ -11,7 +11,7 @@ from engine.result import StageTime
 
 Progress = Callable[[str, float], None]
 """Called with a stage of :data:`STAGES` and the part of it that is done."""
-STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit")
+STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit", "errors")
 """In their order; where no estimator needs a chain the run ends with ``parametric``."""
 
 

@@ -8,7 +8,7 @@ whole of it (:mod:`.refine`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -19,8 +19,9 @@ from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, profile_of
 from engine.parametric.constraints import worst_miss
-from engine.parametric.host_posterior import HostPosterior
+from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.parametric.model import ImageModel
+from engine.parametric.numerical_error import HostShift, host_shifts
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
@@ -33,6 +34,7 @@ from engine.spec.priors import LensParameterName, ParameterPrior
 __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametric"]
 
 GOOD_START = Acceptance()
+_N = COORDINATES.index("n")
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class ParametricFit:
     (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
     times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
     with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
-    of the lensed host [e-/s].
+    of the lensed host [e-/s]. ``shifts`` are the numerical errors of the ``hosts``.
     """
 
     lens: PowerLawLens
@@ -63,6 +65,7 @@ class ParametricFit:
     model: FloatArray
     arc: FloatArray
     sigma: FloatArray
+    shifts: Mapping[IndexPrior, HostShift] = field(default_factory=dict)
 
     @property
     def misfit(self) -> float:
@@ -170,4 +173,7 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         model=(columns @ amplitudes).reshape(shape),
         arc=(columns[:, HOST_FLUX] * flux).reshape(shape),
         sigma=model.sigma,
+        shifts=host_shifts(
+            solution, jacobian, amplitudes, {prior: host.covariance[_N, _N] == 0.0 for prior, host in hosts.items()}
+        ),
     )
