@@ -55,7 +55,7 @@ from engine.parametric.search import Task, find_starts, quick_fits
 from engine.parametric.solution import Solution, minimise
 from engine.posterior.start import prepare_target
 from engine.result import BUDGETED, ERROR_STAGES
-from engine.spec.analysis import ESTIMATORS, PROFILES, EstimatorName
+from engine.spec.analysis import ESTIMATORS, PROFILES, EstimatorName, ProfileName
 
 TABLES = Path(__file__).resolve().parent.parent / "docs" / "tables"
 ROWS, TABLE = TABLES / "error_budget.jsonl", TABLES / "error_budget.md"
@@ -64,10 +64,10 @@ ON_MAPS: tuple[EstimatorName, ...] = tuple(name for name in ESTIMATORS if name !
 DRAWS, BATCH = 400, 25
 
 
-def realizations(runs: int) -> list[tuple[Realization, tuple[str, ...]]]:
+def realizations(runs: int) -> list[tuple[Realization, tuple[ProfileName, ...]]]:
     """As many as `runs` runs need, the systems in turn, each with the profiles that it is analysed with."""
     rng, planned = np.random.default_rng(SEED), 0
-    out: list[tuple[Realization, tuple[str, ...]]] = []
+    out: list[tuple[Realization, tuple[ProfileName, ...]]] = []
     names = system_names()
     while planned < runs:
         host = Host(
@@ -77,7 +77,8 @@ def realizations(runs: int) -> list[tuple[Realization, tuple[str, ...]]]:
         )
         seed = int(rng.integers(2**31))
         realization = Realization(system=names[len(out) % len(names)], l_eta=1.0, host=host, seed=seed)
-        profiles = ("draft", "standard", "reference", *(("paper",) if len(out) % 3 == 2 else ()))[: runs - planned]
+        every: tuple[ProfileName, ...] = ("reference", "draft", "standard")
+        profiles = (*every, "paper")[: runs - planned] if len(out) % 3 == 2 else every[: runs - planned]
         out.append((realization, profiles))
         planned += len(profiles)
     return out
@@ -156,7 +157,7 @@ def map_shifts(
     }
 
 
-def measured(realization: Realization, profiles: Sequence[str]) -> list[dict[str, Any]]:
+def measured(realization: Realization, profiles: Sequence[ProfileName]) -> list[dict[str, Any]]:
     """A row for each profile and estimator."""
     simulation = simulate_realization(realization)
     observation, scene = simulation.observation, simulation.scene
@@ -170,13 +171,14 @@ def measured(realization: Realization, profiles: Sequence[str]) -> list[dict[str
     from_exact = numbers_of(image_of(fit, observation)) - numbers_of(image_of(converged_fit, observation))
     rows: list[dict[str, Any]] = []
     converged: dict[bool, tuple[dict[str, FloatArray], dict[str, dict[str, FloatArray]]]] = {}
-    for profile in sorted(profiles, key="reference draft standard paper".split().index):
+    for profile in sorted(profiles, key=["reference", "draft", "standard", "paper"].index):
         asked = Analysis(profile=profile, priors=priors)
         began = time.process_time()
         found = analyse(observation, asked, generator(replace(realization, analysis=asked), 1), fit=fit)
         seconds = time.process_time() - began
         assert found.inversion is not None
         own = profile == "paper"
+        # The first of them is of `reference`, whose chain all but `paper` are compared with.
         if own not in converged:
             walk = {name: PROFILES["reference"][name] for name in ("walkers", "chain_length", "max_steps")}
             long, answer = Analysis(profile=profile, priors=priors, **walk), found.inversion
@@ -228,7 +230,7 @@ def ratios(rows: Sequence[dict[str, Any]]) -> FloatArray:
     predicted = np.array(
         [[np.sqrt(sum(part**2 for part in row["predicted"][q].values())) for q in BUDGETED] for row in rows]
     )
-    return true / predicted
+    return np.asarray(true / predicted)
 
 
 def summary_line(row: dict[str, Any]) -> str:

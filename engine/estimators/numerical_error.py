@@ -8,7 +8,7 @@ profile that is fitted to it as the normal equations of each estimator say.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,7 +83,7 @@ def source_shifts(
     moved = {stage: _moved(problem.likelihood, best.inversion, here, dm) for stage, dm in lacking.items()}
     return {
         answer: {
-            **{stage: _response(answer, draw, here, fit) for stage, draw in moved.items()},
+            **{stage: _response(answer, draw, fit) for stage, draw in moved.items()},
             "grid": scale * (numbers(there[answer].profile) - numbers(fit.profile)),
         }
         for answer, fit in fits.items()
@@ -185,7 +185,7 @@ def _moved(likelihood: MarginalLikelihood, inversion: Inversion, here: SourceDra
     return replace(here, data_vector=data, drawn=source.reshape(here.drawn.shape))
 
 
-def _response(answer: Answer, moved: SourceDraw, here: SourceDraw, fit: SersicFit) -> FloatArray:
+def _response(answer: Answer, moved: SourceDraw, fit: SersicFit) -> FloatArray:
     """Shift (3,) of the numbers of a fit where map and data vector move by those of ``moved``."""
     estimator, prior = answer
     profile = fit.profile
