@@ -51,10 +51,9 @@ def host_shifts(
     if space.n_agn:
         stars = optics.point_sources(space.agn(values), amplitudes[: space.n_agn])[model.window].ravel() * model.weight
         psf = stars - column[:, : space.n_agn] @ amplitudes[: space.n_agn]
-    # A finer model asks of the parameters what it takes away from the residuals.
-    right = np.stack(
-        [-jacobian.T @ model.residuals(values), *(jacobian[: host.size].T @ dm for dm in (rendering, psf))]
-    )
+    # What a finer model has more of is taken away from the residuals.
+    steps = [jacobian.T @ model.residuals(values), *(-jacobian[: host.size].T @ dm for dm in (rendering, psf))]
+    right = np.stack(steps)
     bound = [space.names.index(name) for name in space.at_bound(values, solution.low, solution.high)]
     at_n = space.host_slice.start + 1
     return {
