@@ -113,5 +113,6 @@ def _request(query: FrontierQuery, profile: str) -> dict[str, Any]:
         "preset": _PAPER,
         **({"systems": systems} if systems else {}),
         "l_eta": [1.0],
+        "replicates": 2,
         "analysis": {"profile": profile, "estimators": [query.estimator]},
     }
