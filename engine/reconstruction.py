@@ -15,6 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from engine.conventions import FloatArray
+from engine.error_target import ROUNDS, first_settings, next_settings, not_kept
 from engine.errors import InversionError
 from engine.estimators.draws import source_draw
 from engine.estimators.error_budget import with_image_budget, with_source_budget
@@ -158,7 +159,7 @@ def analyse(
                     observation, agn_images=agn_images, deflector=deflector, shear=shear, theta_E=theta_E,
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
                 )  # fmt: skip
-        inversion = _sample(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
+        inversion = _sampled(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:
         missing = [prior for prior in _priors(fixed_index) if prior not in fit.hosts]
@@ -168,6 +169,8 @@ def analyse(
             for prior in _priors(fixed_index)
             if prior in fit.hosts
         )
+    if analysis.max_error is not None:
+        warnings += not_kept(estimates, analysis.max_error)
     found = Reconstruction(observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings)
     told = [
         *warnings,
@@ -200,6 +203,28 @@ def undetected(host: Estimate) -> str:
 def _priors(fixed_index: float | None) -> list[IndexPrior]:
     """Priors of n that are asked for."""
     return [prior for prior in INDEX_PRIORS if prior != "fixed" or fixed_index is not None]
+
+
+def _sampled(
+    observation: Observation,
+    fit: ParametricFit,
+    analysis: Analysis,
+    rng: np.random.Generator,
+    fixed_index: float | None,
+    watch: Stopwatch,
+) -> SampledInversion:
+    """The chain as it was asked for, or as the numerical error that was asked for needs it."""
+    if analysis.max_error is None:
+        return _sample(observation, fit, analysis, rng, fixed_index, watch)
+    settings = first_settings(analysis)
+    found = _sample(observation, fit, settings, rng, fixed_index, watch)
+    for _ in range(ROUNDS - 1):
+        following = next_settings(settings, found.estimates, analysis.max_error)
+        if following is None:
+            break
+        settings = following
+        found = _sample(observation, fit, settings, rng, fixed_index, watch)
+    return found
 
 
 def _sample(

@@ -225,8 +225,8 @@ class Products:
 class RunResult:
     """The outcome of one run.
 
-    ``profile`` names the analysis profile, None where the analysis was put together by hand. An estimator that could
-    not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
+    ``profile`` names the analysis profile, None where the run chose its settings (``max_error``). An estimator that
+    could not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
     ``chain``, ``ln_evidence``, ``condition_number`` and ``aperture`` are None where no estimator needed an inversion;
     ``lens``, ``chi2`` and ``degrees_of_freedom`` are then those of the parametric fit. With one,
     ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.

@@ -153,7 +153,8 @@ class CostKind(_Answer):
 
     camera: str
     configuration: str
-    profile: str
+    profile: str | None
+    """Null where runs choose their settings (``max_error``)."""
 
 
 class Cost(_Answer):

@@ -23,9 +23,9 @@ from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
-from service.store.leases import Lease
+from service.store.leases import Lease, Outcome
 from service.store.migrate import upgrade
-from service.store.queue import RunQueue
+from service.store.queue import Failure, RunQueue
 from tests.service.conftest import empty
 from tests.service.plans import result_of
 
@@ -39,6 +39,7 @@ CPU = {"draft": 5.0, "standard": 12.0}
 @dataclass(frozen=True)
 class Stored:
     client: TestClient
+    database: Database
     runs: dict[str, list[str]]
     payloads: dict[str, ResultPayload]
 
@@ -72,7 +73,7 @@ def stored(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         queue.store(lease, payloads[lease.run_id])
         runs[profile].append(lease.run_id)
     with TestClient(create_app(Settings(database_url=url, data_dir=folder))) as client:
-        yield Stored(client, runs, payloads)
+        yield Stored(client, database, runs, payloads)
     database.close()
 
 
@@ -187,3 +188,27 @@ def test_client_and_command_tell_the_same(
     told = stored.ask(max_error=asked, system="HE0435")["told"]
     assert result.output.startswith(told)
     assert ("39 of 40" in result.output) == (code == 0)
+
+
+def test_an_error_may_be_asked_of_a_run_and_is_refused_by_name(stored: Stored) -> None:
+    asked = {**POINT, "analysis": {"profile": "draft", "max_error": 0.02}}
+    dry = stored.client.post("/v1/grids?dry_run=true", json=asked).json()
+    # What such a run takes is not what runs of `draft` take.
+    assert [kind["profile"] for kind in dry["cost"]["unknown"]] == [None]
+    asked["analysis"]["max_error"] = 0
+    refused = stored.client.post("/v1/grids", json=asked)
+    assert refused.status_code == 422
+    assert [place["pointer"] for place in refused.json()["errors"]] == ["/analysis/max_error"]
+
+
+def test_a_failed_run_that_was_to_choose_its_settings_is_of_no_profile(stored: Stored) -> None:
+    asked = GridRequest.model_validate({**POINT, "analysis": {"profile": "draft", "max_error": 0.02}})
+    GridStore(stored.database).create(asked.canonical(), lambda: plan(asked, 10))
+    queue = RunQueue(stored.database)
+    generation = Leadership(stored.database).take("another", lambda _: True)
+    assert generation is not None
+    (lease,) = queue.claim(generation, 10)
+    queue.fail(lease, Failure(Outcome.ERROR, "error", "on purpose", 0))
+    for profile, failed in (("none", 1), ("draft", 0)):
+        found = stored.client.get("/v1/summary", params={"profile": profile, "group_by": "profile"}).json()
+        assert found["failed_elsewhere"] + sum(row["failed"] for row in found["rows"]) == failed

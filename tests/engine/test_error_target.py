@@ -1,0 +1,99 @@
+"""A run that is asked for an error chooses the settings that keep it, or says that it cannot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from engine.error_target import first_settings, next_settings, not_kept
+from engine.errors import SpecError
+from engine.experiment import run
+from engine.result import BUDGETED, ErrorBudget, Estimate, NumericalError, Quantity
+from engine.spec.analysis import PROFILES, Analysis
+from engine.spec.realization import Realization, realization_from_dict
+
+BASE = Analysis(max_error=0.02, estimators=("projected",))
+
+
+def estimate(sd: float, grid: float, draws: float, *, name: str = "projected", known: bool = True) -> Estimate:
+    """One whose magnitude errs as told."""
+    nothing = NumericalError(0.0, 0.0, 0.0, 0.0, 0.0)
+    budget = ErrorBudget(NumericalError(0.0, 0.0, grid, 0.0, draws), nothing, nothing) if known else None
+    return Estimate(name, "wide", Quantity(20.5, sd), *[Quantity(1.0, 0.0)] * 7, 30, 0, 0, 0, 0, budget)  # type: ignore[arg-type]
+
+
+def test_it_begins_with_the_walk_of_draft() -> None:
+    first = first_settings(Analysis(profile="reference", max_error=0.02, draws=50, source_pixels=(24, 22)))
+    assert {name: getattr(first, name) for name in PROFILES["draft"]} == PROFILES["draft"]
+    assert (first.draws, first.source_pixels) == (50, (24, 22))
+
+
+def test_where_the_error_is_kept_nothing_more_is_done() -> None:
+    assert next_settings(first_settings(BASE), [estimate(0.08, 0.01, 0.0149)], 0.02) is None
+    assert not_kept([estimate(0.08, 0.01, 0.0149)], 0.02) == ()
+
+
+def test_more_draws_come_with_a_chain_that_has_as_many_states() -> None:
+    found = next_settings(first_settings(BASE), [estimate(0.3, 0.0, 0.055)], 0.02)
+    assert found is not None
+    # sd / sqrt(k) at nine tenths of what is allowed.
+    assert found.draws == pytest.approx((0.3 / 0.018) ** 2, abs=1)
+    assert found.walkers * found.chain_length > found.draws
+    assert found.source_pixels == BASE.source_pixels
+
+
+def test_a_grid_grows_until_its_error_which_falls_with_the_cells_is_small_enough() -> None:
+    found = next_settings(first_settings(BASE), [estimate(0.02, 0.025, 0.0037)], 0.02)
+    assert found is not None
+    ny, nx = found.source_pixels
+    assert 0.025 * (400 / (ny * nx)) <= 0.7 * 0.9 * 0.02 + 1e-12
+    assert ny * nx < 2.5 * 400
+
+
+def test_nothing_costs_more_than_reference() -> None:
+    found = next_settings(first_settings(BASE), [estimate(3.0, 1.0, 0.5)], 0.001)
+    assert found is not None
+    reference = Analysis(profile="reference")
+    cost = found.walkers * found.chain_length * (found.source_pixels[0] * found.source_pixels[1]) ** 1.5
+    assert cost <= reference.walkers * reference.chain_length * 400**1.5 * (1 + 1e-9)
+    assert found.draws <= 1000
+    # What is reached by then is told, and what is not known too.
+    (told,) = not_kept([estimate(3.0, 1.0, 0.5)], 0.001)
+    assert told == "max_error: projected has a numerical error of 1.1 mag, 0.001 is asked for"
+    assert not_kept([estimate(3.0, 0.0, 0.0, known=False)], 0.001) == (
+        "max_error: the numerical error of projected could not be predicted",
+    )
+
+
+@pytest.mark.parametrize("wrong", [0.0, -0.1, 11.0, float("nan"), True, "0.02"])
+def test_an_error_that_cannot_be_asked_for_is_refused(realization: Realization, wrong: object) -> None:
+    document = realization.to_dict()
+    document["analysis"]["max_error"] = wrong
+    with pytest.raises(SpecError, match="max_error"):
+        realization_from_dict(document)
+
+
+def test_the_digest_covers_it_and_is_what_it_was_without(realization: Realization) -> None:
+    assert "max_error" not in realization.to_dict()["analysis"]
+    asked = replace(realization, analysis=replace(realization.analysis, max_error=0.02))
+    assert asked.digest != realization.digest
+    assert asked.observation_digest == realization.observation_digest
+    assert realization_from_dict(asked.to_dict()) == asked
+
+
+def test_a_run_reaches_the_error_that_it_is_asked_for(realization: Realization) -> None:
+    """Four draws on 12 x 12 nodes do not keep 0.015 mag; the run finds what does."""
+    analysis = replace(realization.analysis, max_error=0.015, estimators=("projected", "image"))
+    found = run(replace(realization, analysis=analysis))
+    projected = found.estimate("projected", "wide")
+    assert projected.budget is not None
+    assert found.profile is None
+    assert all(getattr(projected.budget, name).total >= 0.0 for name in BUDGETED)
+    kept = projected.budget.magnitude.total <= 0.015
+    assert kept == (not any(told.startswith("max_error") for told in found.warnings))
+    assert kept
+    # It was not kept at once, and each stage is told once with all the time that it took.
+    assert projected.draws > analysis.draws
+    names = [stage.stage for stage in found.stages]
+    assert len(names) == len(set(names))
