@@ -9,7 +9,7 @@ import pytest
 from engine.error_target import first_settings, next_settings, not_kept
 from engine.errors import SpecError
 from engine.experiment import run
-from engine.result import BUDGETED, ErrorBudget, Estimate, NumericalError, Quantity
+from engine.result import ErrorBudget, Estimate, NumericalError, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.spec.realization import Realization, realization_from_dict
 
@@ -82,18 +82,17 @@ def test_the_digest_covers_it_and_is_what_it_was_without(realization: Realizatio
     assert realization_from_dict(asked.to_dict()) == asked
 
 
-def test_a_run_reaches_the_error_that_it_is_asked_for(realization: Realization) -> None:
-    """Four draws on 12 x 12 nodes do not keep 0.015 mag; the run finds what does."""
-    analysis = replace(realization.analysis, max_error=0.015, estimators=("projected", "image"))
+def test_a_run_goes_on_until_its_error_is_kept_or_says_that_it_is_not(realization: Realization) -> None:
+    """Four draws on 12 x 12 nodes err by 0.005 mag; the run goes on to more draws and nodes."""
+    analysis = replace(realization.analysis, max_error=0.003, estimators=("projected", "image"))
     found = run(replace(realization, analysis=analysis))
     projected = found.estimate("projected", "wide")
     assert projected.budget is not None
     assert found.profile is None
-    assert all(getattr(projected.budget, name).total >= 0.0 for name in BUDGETED)
-    kept = projected.budget.magnitude.total <= 0.015
-    assert kept == (not any(told.startswith("max_error") for told in found.warnings))
-    assert kept
-    # It was not kept at once, and each stage is told once with all the time that it took.
+    kept = projected.budget.magnitude.total <= 0.003
+    assert kept == (not any(told.startswith("max_error: projected") for told in found.warnings))
+    assert not any(told.startswith("max_error: image") for told in found.warnings)
     assert projected.draws > analysis.draws
+    # Each stage is told once, with all the time that it took.
     names = [stage.stage for stage in found.stages]
     assert len(names) == len(set(names))
