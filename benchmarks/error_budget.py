@@ -240,7 +240,7 @@ def summary_line(row: dict[str, Any]) -> str:
 
 HEAD = """# Predicted numerical errors
 
-Written by `python -m benchmarks.error_budget` from [its rows](error_budget.jsonl): the true numerical error of runs
+Written by `python -m benchmarks.error_budget` from its rows in error_budget.jsonl: the true numerical error of runs
 beside the predicted one, of estimates with n in 0.3-8. `below 2` is the share of runs whose true error is less than
 twice the predicted, `median` and `rms` are those of true by predicted (0.67 and 1 where errors are normal and the
 prediction is right). Sizes are medians.
