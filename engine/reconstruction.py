@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from engine.conventions import FloatArray
 from engine.error_target import ROUNDS, first_settings, next_settings, not_kept
-from engine.errors import InversionError
+from engine.errors import InversionError, LensEquationError
 from engine.estimators.draws import source_draw
 from engine.estimators.error_budget import with_image_budget, with_source_budget
 from engine.estimators.image import image_estimate
@@ -263,8 +263,8 @@ def _sample(
         state = BestState(target.lens(at_best), float(at_best[-1]), best)
         try:
             shifts = source_shifts(observation, problem, target.source, state, analysis.psf_radius, drawn, fixed_index)
-        except InversionError as error:
-            warnings.append(f"numerical error: not predicted, on another source grid {error}")
+        except (InversionError, LensEquationError) as error:
+            warnings.append(f"numerical error: not predicted, {error}")
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "

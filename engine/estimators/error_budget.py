@@ -27,7 +27,7 @@ def with_image_budget(estimate: Estimate, shift: HostShift | None) -> Estimate:
             draws=0.0,
         )
 
-    return replace(estimate, budget=ErrorBudget(of(0, MAGNITUDES), of(1, estimate.r_eff.mean), of(2, 1.0)))
+    return _with(estimate, ErrorBudget(of(0, MAGNITUDES), of(1, estimate.r_eff.mean), of(2, 1.0)))
 
 
 def with_source_budget(estimate: Estimate, shifts: dict[str, FloatArray] | None, effective_samples: float) -> Estimate:
@@ -53,6 +53,10 @@ def with_source_budget(estimate: Estimate, shifts: dict[str, FloatArray] | None,
             draws=spread.sd * math.sqrt(max(1.0 / fitted - 1.0 / effective_samples, 0.0)),
         )
 
-    return replace(
-        estimate, budget=ErrorBudget(*(of(place, getattr(estimate, name)) for place, name in enumerate(BUDGETED)))
-    )
+    return _with(estimate, ErrorBudget(*(of(place, getattr(estimate, name)) for place, name in enumerate(BUDGETED))))
+
+
+def _with(estimate: Estimate, budget: ErrorBudget) -> Estimate:
+    """The estimate with its budget; without where the response of a fit that knows nothing is no number."""
+    known = all(math.isfinite(getattr(budget, name).total) for name in BUDGETED)
+    return replace(estimate, budget=budget) if known else estimate

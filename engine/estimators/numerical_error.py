@@ -69,6 +69,8 @@ def source_shifts(
     ------
     InversionError
         The other grid's inversion cannot be trusted.
+    LensEquationError
+        The images of the fitted host are not found.
     """
     names: list[EstimatorName] = list(dict.fromkeys([*estimators, "projected"]))
     here, fits = mean_draw(best), fits_of_map(best, names, fixed_index)

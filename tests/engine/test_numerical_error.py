@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from engine.conventions import FloatArray
+from engine.estimators.error_budget import with_source_budget
 from engine.estimators.numerical_error import BestState, fits_of_map, numbers, ray_light, source_shifts
 from engine.likelihood.evidence import invert
 from engine.likelihood.problem import Problem, prepare_problem
@@ -15,6 +16,7 @@ from engine.parametric.fit import GOOD_START, ParametricFit, fit_of
 from engine.parametric.refine import polished, ranked
 from engine.parametric.search import Task, find_starts, quick_fits
 from engine.parametric.solution import Solution, minimise
+from engine.result import Estimate, Quantity
 from engine.simulation.simulate import Simulation
 from engine.source.regularisation import SourceModel
 from engine.spec.analysis import Analysis, EstimatorName
@@ -84,3 +86,17 @@ def test_rays_of_a_host_are_those_of_its_envelope(fit: ParametricFit, problem: P
     own = rays.of_envelope()
     light = ray_light(rays, rays.envelope.host, fit.lens)
     np.testing.assert_allclose(light, own, atol=1e-6 * own.max())
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_an_error_that_is_no_number_is_no_budget(wrong: float) -> None:
+    shifts = {stage: np.array([0.1, 0.01, 0.2]) for stage in ("rendering", "psf", "grid")}
+    known = Quantity(20.0, 0.1)
+    plain = Estimate("paper", "wide", *[known] * 8, 30, 0, 0, 0, 0)
+    told = with_source_budget(plain, shifts, 120.0).budget
+    assert told is not None
+    assert told.magnitude.total == pytest.approx(np.sqrt(3 * 0.1**2 + 0.1**2 / 30))
+    shifts["psf"][2] = wrong
+    assert with_source_budget(plain, shifts, 120.0).budget is None
+    # One draw has no spread to tell of.
+    assert with_source_budget(replace(plain, failed=29), shifts, 120.0).budget is None
