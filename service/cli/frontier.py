@@ -48,10 +48,10 @@ def _table(found: FrontierAnswer) -> Table:
     from rich import box  # noqa: PLC0415 - as above
     from rich.table import Table  # noqa: PLC0415
 
-    unit = "" if found.unit is None else f" [{found.unit}]"
+    unit = "" if found.unit is None else f" ({found.unit})"
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title_justify="left")
     table.title = f"Numerical error of {found.quantity}{unit} by {found.estimator}, n {found.index_prior}"
-    for name in ("profile", "runs", "median", "95 %", f"below {found.max_error:g}", "68 % interval", "CPU [s]"):
+    for name in ("profile", "runs", "median", "95 %", f"below {found.max_error:g}", "68 % interval", "CPU s"):
         table.add_column(name, justify="left" if name == "profile" else "right")
     for row in found.profiles:
         runs = str(row.stored) if row.stored == row.with_error else f"{row.with_error}/{row.stored}"

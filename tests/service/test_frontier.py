@@ -188,6 +188,7 @@ def test_client_and_command_tell_the_same(
     told = stored.ask(max_error=asked, system="HE0435")["told"]
     assert result.output.startswith(told)
     assert ("39 of 40" in result.output) == (code == 0)
+    assert "Numerical error of magnitude (mag) by image, n wide" in result.output
 
 
 def test_an_error_may_be_asked_of_a_run_and_is_refused_by_name(stored: Stored) -> None:
