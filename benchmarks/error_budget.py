@@ -1,6 +1,6 @@
 """The predicted numerical error of runs against the true one.
 
-    python -m benchmarks.error_budget [--runs 60] [--seconds 3600]
+    python -m benchmarks.error_budget [--runs 60] [--seconds 3600] [--systems HE0435 ...]
 
 Realizations of the eight systems are drawn with a fixed seed; each is analysed with `draft`, `standard` and
 `reference`, every third with `paper` too. The true error of an estimate (n in 0.3-8) is its distance from a converged
@@ -303,12 +303,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--runs", type=int, default=60)
     parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no realization after so many")
+    parser.add_argument("--systems", nargs="+", default=list(system_names()), help="those alone of the realizations")
     given = parser.parse_args()
     began = time.monotonic()
     rows = [json.loads(line) for line in ROWS.read_text().splitlines()] if ROWS.exists() else []
     known = {(row["digest"], row["engine"]) for row in rows}
     for realization, profiles in realizations(given.runs):
-        if (realization.digest, engine_digest()) in known:
+        if (realization.digest, engine_digest()) in known or realization.system_name not in given.systems:
             continue
         if time.monotonic() - began > given.seconds:
             break
