@@ -9,7 +9,6 @@ import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 
-from engine import system_names
 from service.api.answer_views import share_view, six
 from service.api.context import Service
 from service.api.freshness import NOT_MODIFIED, REVALIDATED, IfNoneMatch, is_known, not_modified, weak_tag
@@ -17,6 +16,7 @@ from service.api.results import ESTIMATORS, PRIORS, RECOMMENDED_PARTS, FilterBod
 from service.api.threads import Route, patient
 from service.domain.answers import FrontierAnswer
 from service.domain.payload import BUDGETED
+from service.domain.requests import list_systems
 from service.store.answers import Question
 from service.store.bias_rows import content
 from service.store.frontier import KEPT, ProfileErrors, profile_errors
@@ -107,7 +107,8 @@ def _profile_view(query: FrontierQuery, found: ProfileErrors) -> dict[str, Any]:
 
 def _request(query: FrontierQuery, profile: str) -> dict[str, Any]:
     """A body of POST /v1/grids, the paper's hosts at its lower slope: runs of a profile from which it can be known."""
-    systems = [name for name in given_filter(query).get("system", []) if name in system_names()]
+    known = {item.name for item in list_systems()}
+    systems = [name for name in given_filter(query).get("system", []) if name in known]
     return {
         "name": f"errors of {profile}",
         "preset": _PAPER,
