@@ -136,8 +136,7 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     """A solution as it is handed on; a PosteriorError where it is no good."""
     model, values, space = solution.model, solution.values, solution.space
     jacobian, amplitudes = model.full_jacobian(values)
-    host_departs, unmodelled = model.explained(values)
-    rest = model.observed - model.weight * (model.image(values, amplitudes) + unmodelled).ravel()
+    host_departs, unmodelled, rest = model.explained(values)
     chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes - round(model.shared_parameters)
     flux = float(amplitudes[HOST_FLUX])
     if not flux > 0:

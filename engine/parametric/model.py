@@ -85,10 +85,11 @@ class ImageModel:
         inside = sigma[window]
         self.weight = np.where(np.isfinite(inside), 1.0 / inside, 0.0).ravel()
         image = np.where(observation.valid, observation.image, 0.0)[window]
-        self.observed = image.ravel() * self.weight
+        observed = image.ravel() * self.weight
         self.shared = shared
         self._shared = None if shared is None else shared.whitened(self.weight)
-        self._target = self.observed if self._shared is None else self.observed + self._shared.offset
+        self._observed = observed if self._shared is None else observed + self._shared.offset
+        self._target = self._observed
         self.data = self.decorrelated(self._target)
         self.pixels = int(np.count_nonzero(self.weight))
         self._anchors: dict[int, tuple[float, float, FloatArray]] = {}
@@ -177,7 +178,8 @@ class ImageModel:
             exact = self.observation.optics.sersic_image(profile, behind)[self.window]
             defect += brightness * (exact.ravel() * self.weight - column)
         out = copy(self)
-        out.data = self.decorrelated(self._target - defect)
+        out._target = self._observed - defect
+        out.data = self.decorrelated(out._target)
         out._anchors = {}
         return out
 
@@ -222,16 +224,22 @@ class ImageModel:
         flat = np.divide(rendered, self.weight, out=np.zeros_like(rendered), where=self.weight > 0)
         return flat.reshape(self.shape)
 
-    def explained(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What shared errors add to the model [e-/s], shape of the window: the host's, and all of them."""
+    def explained(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What shared errors add to the model [e-/s], and what neither explains.
+
+        The first two have the window's shape, what the host's errors add and what all of them do; the last are whitened
+        residuals (pixels,).
+        """
+        amplitudes, rest, columns = self.amplitudes(values)
         if self.shared is None or self._shared is None:
-            return np.zeros(self.shape), np.zeros(self.shape)
-        amplitudes, _, columns = self.amplitudes(values)
+            return np.zeros(self.shape), np.zeros(self.shape), rest
+        without = self._target - columns @ amplitudes
+        found = self._shared.amplitudes(without)
         # What the mean amplitudes do is in the stamp of the observation already.
-        found = self._shared.amplitudes(self._target - columns @ amplitudes) - self.shared.mean
-        of_host = self.shared.of_host
-        host = self.shared.columns[:, :of_host] @ found[:of_host]
-        return host.reshape(self.shape), (self.shared.columns @ found).reshape(self.shape)
+        added, of_host = found - self.shared.mean, self.shared.of_host
+        host = self.shared.columns[:, :of_host] @ added[:of_host]
+        rest = without - self._shared.columns @ found
+        return host.reshape(self.shape), (self.shared.columns @ added).reshape(self.shape), rest
 
     def unwhitened(self, columns: FloatArray, amplitudes: FloatArray) -> FloatArray:
         """Image (ny, nx) [e-/s] of some of the whitened columns; zero where pixels do not count and off the window."""

@@ -55,7 +55,10 @@ def learned(
     """
     model, space = solution.model, solution.space
     amplitudes, _, _ = model.amplitudes(solution.values)
-    host = _flat(lensed_modes(model, solution.values, float(amplitudes[HOST_FLUX])))
+    host = np.zeros((model.data.size, 0))
+    # One that is as large as the ring is the deflector's wings or the sky: its departures would be theirs.
+    if space.host(solution.values).r_eff < solution.lens.theta_E:
+        host = _flat(lensed_modes(model, solution.values, float(amplitudes[HOST_FLUX])))
     modes = stamp_modes(given) if space.n_agn else np.zeros((0, *given.shape))
     psf = _flat(laid_modes(modes, _places(solution), model.shape))
     residual = model.observation.image.ravel() - model.image(solution.values, amplitudes).ravel()
@@ -73,7 +76,13 @@ def learned(
     correction = of_psf * found.amplitudes[host.shape[1] :]
     mean = np.concatenate([np.zeros(host.shape[1]), found.amplitudes[host.shape[1] :]])
     return Learned(
-        error=ModelError(of_psf, of_host, found.gain, np.tensordot(correction, modes, axes=1)),
+        error=ModelError(
+            of_psf,
+            of_host,
+            found.gain,
+            np.tensordot(correction, modes, axes=1),
+            flux_without=float(amplitudes[HOST_FLUX]) if known is None else known.flux_without,
+        ),
         shared=SharedError(np.concatenate([of_host * host, of_psf * psf], axis=1), mean, host.shape[1]),
         left=found.left,
     )

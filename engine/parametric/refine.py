@@ -87,7 +87,7 @@ def _with_model_error(task: Task, solution: Solution) -> Solution:
     given, known = task.observation.psf, solution.error
     for _ in range(_ROUNDS):
         stamps, extended = _variances(task, solution)
-        base = weights_sigma(task.observation, extended)
+        base = weights_sigma(task.observation, extended + _noise_excess(task, solution))
         found = learned(solution, given, known, base, stamps, _fitted(task, solution.lens, solution.agn()))
         if found is None:
             break
@@ -96,6 +96,15 @@ def _with_model_error(task: Task, solution: Solution) -> Solution:
         solution = replace(solution, stamp_error=found.left, error=known)
         solution = _full(task, solution, _sigma(task, solution), shear=task.may_shear, shared=found.shared)
     return solution
+
+
+def _noise_excess(task: Task, solution: Solution) -> FloatArray:
+    """Variance (ny, nx) that the noise map lacks by the scatter outside the lens: it is no error of the model."""
+    model, observation = solution.model, task.observation
+    amplitudes, _, _ = model.amplitudes(solution.values)
+    residual = observation.image - model.image(solution.values, amplitudes)
+    scale = noise_scale(observation, residual, model.sigma, solution.lens) or 1.0
+    return np.where(observation.valid, (max(1.0, scale) ** 2 - 1.0) * observation.noise**2, 0.0)
 
 
 def _full(

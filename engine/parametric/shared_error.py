@@ -76,13 +76,15 @@ class SharedError:
 class ModelError:
     """What is known of the errors of a model: their strengths, as parts of the light that is wrong.
 
-    ``correction`` (n, n) is added to the stamp that was given; ``gain`` is ln of the evidence for all of it.
+    ``correction`` (n, n) is added to the stamp that was given; ``gain`` is ln of the evidence for all of it;
+    ``flux_without`` [e-/s] is the host's where the model is taken for exact.
     """
 
     psf: float
     host: float
     gain: float
     correction: FloatArray
+    flux_without: float
 
 
 @dataclass(frozen=True, eq=False)
