@@ -26,6 +26,7 @@ from engine.parametric.parameters import BACKGROUND, HOST_FLUX
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
+from engine.parametric.shared_error import ModelError
 from engine.parametric.solution import Solution
 from engine.parametric.uncertainty import host_posteriors, parameter_covariance
 from engine.result import IndexPrior
@@ -47,7 +48,8 @@ class ParametricFit:
     (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
     times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
     with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
-    of the lensed host [e-/s]. ``shifts`` are the numerical errors of the ``hosts``.
+    of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how much,
+    or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are the numerical errors of the ``hosts``.
     """
 
     lens: PowerLawLens
@@ -65,6 +67,8 @@ class ParametricFit:
     model: FloatArray
     arc: FloatArray
     sigma: FloatArray
+    psf: FloatArray
+    error: ModelError | None
     shifts: Mapping[IndexPrior, HostShift] = field(default_factory=dict)
 
     @property
@@ -135,8 +139,8 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     """A solution as it is handed on; a PosteriorError where it is no good."""
     model, values, space = solution.model, solution.values, solution.space
     jacobian, amplitudes = model.full_jacobian(values)
-    _, rest, _ = model.amplitudes(values)
-    chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes
+    host_departs, unmodelled, rest = model.explained(values)
+    chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes - round(model.shared_parameters)
     flux = float(amplitudes[HOST_FLUX])
     if not flux > 0:
         raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
@@ -153,8 +157,8 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     inflation = max(1.0, chi2 / freedom)
     covariance = inflation * parameter_covariance(model, jacobian)
     hosts = host_posteriors(solution, covariance, inflation, fixed_index)
-    shape = task.observation.shape
-    shown = ImageModel(task.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True)
+    shape = model.observation.shape
+    shown = ImageModel(model.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True)
     columns = shown.columns(values)
     deflector = profile_of(values[space.deflector_slice], float(amplitudes[space.n_agn])) if space.deflector else None
     return ParametricFit(
@@ -170,9 +174,11 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         degrees_of_freedom=freedom,
         stamp_error=solution.stamp_error,
         at_bound=solution.at_bound,
-        model=(columns @ amplitudes).reshape(shape),
-        arc=(columns[:, HOST_FLUX] * flux).reshape(shape),
+        model=(columns @ amplitudes).reshape(shape) + unmodelled,
+        arc=(columns[:, HOST_FLUX] * flux).reshape(shape) + host_departs,
         sigma=model.sigma,
+        psf=model.observation.psf,
+        error=solution.error,
         shifts=host_shifts(
             solution, jacobian, amplitudes, {prior: host.covariance[_N, _N] == 0.0 for prior, host in hosts.items()}
         ),

@@ -52,7 +52,8 @@ def host_shifts(
         stars = optics.point_sources(space.agn(values), amplitudes[: space.n_agn])[model.window].ravel() * model.weight
         psf = stars - column[:, : space.n_agn] @ amplitudes[: space.n_agn]
     # What a finer model has more of is taken away from the residuals.
-    steps = [jacobian.T @ model.residuals(values), *(-jacobian[: host.size].T @ dm for dm in (rendering, psf))]
+    lacking = (model.decorrelated(dm) for dm in (rendering, psf))
+    steps = [jacobian.T @ model.residuals(values), *(-jacobian[: host.size].T @ dm for dm in lacking)]
     right = np.stack(steps)
     bound = [space.names.index(name) for name in space.at_bound(values, solution.low, solution.high)]
     at_n = space.host_slice.start + 1
