@@ -49,7 +49,7 @@ class ParametricFit:
     times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
     with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
     of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how much,
-    or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are the numerical errors of the ``hosts``.
+    or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are numerical errors of the ``hosts``.
     """
 
     lens: PowerLawLens
