@@ -217,7 +217,7 @@ class RunResult:
     agn_contrast: float | None
     surface_brightness: float
     stages: tuple[StageTime, ...]
-    work: Work = Work()
+    work: Work
     warnings: tuple[str, ...] = ()
     profile: str | None = None
     products: Products | None = field(default=None, repr=False, compare=False)

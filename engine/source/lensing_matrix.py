@@ -80,8 +80,8 @@ class LensingMatrix:
     def dense(self) -> FloatArray:
         """L as an array of shape (pixels, ny nx)."""
         out = np.zeros((self.entries.size, self.grid.x.size * self.grid.y.size))
-        for row, count in enumerate(self.entries):
-            np.add.at(out[row], self.columns[row, :count], self.weights[row, :count])
+        for row, used in enumerate(self.entries):
+            np.add.at(out[row], self.columns[row, :used], self.weights[row, :used])
         return out
 
     def of_brightness(self, envelope: FloatArray) -> LensingMatrix:
