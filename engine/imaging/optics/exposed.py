@@ -15,13 +15,12 @@ from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.imaging.convolution import convolve, point_source_image
-from engine.imaging.cusps import place_cusps
+from engine.imaging.cusps import cusp_positions, place_cusps
 from engine.imaging.drizzling import drizzle_weights
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry
 from engine.imaging.optics.exposed_matrix import exposed_blurring_matrix
 from engine.imaging.optics.interface import Pixels
-from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
@@ -56,10 +55,7 @@ class ExposedOptics:
         """Drizzled image (ny, nx) [e-/s per pixel] of a Sersic profile, behind a lens or not."""
         geometry = self.geometry
         light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens)
-        if lens is None:
-            cusps = [(profile.x, profile.y)]
-        else:
-            cusps = [(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)]
+        cusps = cusp_positions(profile, lens, geometry)
         blurred = convolve(place_cusps(light, profile, cusps, geometry, lens), self.psf)
         return self._drizzled(blurred)
 
