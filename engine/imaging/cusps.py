@@ -25,8 +25,8 @@ _FINE = 5
 """Cells along a sub-pixel."""
 _HALF = 12
 """Radius round a cusp within which light is moved [sub-pixels]: beyond it the light is smooth on their scale."""
-_ON_RING = 4
-"""Distance of points on a ring [sub-pixels]: all light within a few sub-pixels of it is moved."""
+_ON_RING = 10
+"""Distance of points on a ring [sub-pixels]: between two of them more than eight tenths of its light are moved."""
 _NODES = 8
 """Sub-pixels along each axis among which a cell's light is divided: Lagrange interpolation of order 7."""
 

@@ -23,6 +23,7 @@ from engine import (
 from engine.conventions import pixel_centres
 from engine.likelihood.evidence import invert
 from engine.likelihood.problem import prepare_problem
+from engine.likelihood.strength import find_strength
 from engine.simulation.scene import Scene, build_scene, check_system
 from engine.simulation.simulate import Simulation, simulate
 from engine.source.regularisation import SourceModel
@@ -42,30 +43,34 @@ def round_system(offset: float = 0.0, *, agn: bool = False) -> LensSystem:
     return changed if agn else replace(changed, agn=())
 
 
-@pytest.mark.parametrize("n", [1.0, 4.0])
-def test_a_host_exactly_behind_a_round_lens_is_a_ring_and_is_measured(n: float) -> None:
+@pytest.mark.parametrize("n", [1.0, pytest.param(4.0, marks=pytest.mark.long)])
+def test_a_host_exactly_behind_a_round_lens_is_a_ring_and_is_inverted(n: float) -> None:
     """A lens of q = 1 exactly, no shear, no AGN, and a host exactly behind its centre: a perfect Einstein ring.
 
-    Could go wrong: the lens equation of the host's centre has no points for solutions, the angle of the lens no
-    meaning, and q is at its bound. Holds: the ring is simulated, the same in each quadrant to 1e-3 of its peak, and the
-    image estimator is right to 3.5 of its deviations in magnitude and radius.
+    Could go wrong: the lens equation of the host's centre has a circle for its solution, and no points at which to put
+    the cusp of the profile. Holds: the ring is simulated, the same in each quadrant to 1e-3 of its peak and, through
+    telescope and drizzle, that of a host 1e-4 arcsec beside to 1e-3; and the inversion explains it: its chi^2 per
+    pixel is between 0.85 and 1.1.
     """
-    realization = Realization(
-        system=round_system(), l_eta=1.0, host=Host(n=n, r_eff=0.39, magnitude=20.5, q=1.0), analysis=IMAGE
-    )
-    arc = simulate(build_scene(realization), "author", np.random.default_rng(0)).high_resolution_arc
+    host = Host(n=n, r_eff=0.39, magnitude=20.5, q=1.0)
+    scenes = [build_scene(Realization(system=round_system(offset), l_eta=1.0, host=host)) for offset in (0.0, 1e-4)]
+    behind, beside = (simulate(one, "author", np.random.default_rng(0)) for one in scenes)
+    arc = behind.high_resolution_arc
     assert np.abs(arc - arc[::-1]).max() < 1e-3 * arc.max()
     assert np.abs(arc - arc.T).max() < 1e-3 * arc.max()
-    found = run(realization).estimate("image", "wide")
-    for value in (found.magnitude, found.r_eff):
-        assert value.bias is not None
-        assert abs(value.bias) < 3.5 * value.sd
+    assert np.abs(behind.arc - beside.arc).max() < 1e-3 * beside.arc.max()
+    lens, model = behind.scene.lens, SourceModel((20, 20))
+    problem = prepare_problem(behind.observation, true_fit(behind.scene), Analysis(noise_treatment="diagonal"))
+    found = invert(problem.likelihood, lens, find_strength(problem.likelihood, lens, model).ln_lambda, model)
+    seen = problem.likelihood.blurring @ found.lensing.apply(found.source.ravel())
+    chi2 = problem.likelihood.chi2(seen, problem.likelihood.fit_amplitudes(seen))
+    assert 0.85 < chi2 / problem.likelihood.data_points < 1.1
 
 
 def test_an_agn_exactly_behind_a_round_lens_is_refused() -> None:
     """The same lens with an AGN in the host's centre: its image is a ring of infinite magnification.
 
-    Could go wrong: four of the ring's points are taken for images. Holds: the system is refused, with the caustic named.
+    Could go wrong: four of the ring's points are taken for images. Holds: the system is refused, the caustic named.
     """
     with pytest.raises((LensEquationError, SpecError), match="caustic"):
         check_system(round_system(agn=True))
@@ -76,8 +81,9 @@ def test_a_star_on_the_corner_of_a_pixel_has_the_flux_of_one_on_its_centre(simul
     """A point source exactly on the corner, the side and the centre of an image pixel.
 
     Could go wrong: rounding half a pixel up in one place and down in another moves it by a pixel, or loses a row of its
-    light. Holds: a moved stamp keeps its flux to 1e-12 and its centre of light to 1e-9 pixels; through the exposures
-    flux is kept to 2e-4, and 1e-9 arcsec to either side of the corner make no difference beyond 1e-6 of the peak.
+    light. Holds: flux is kept to 2e-4 through the exposures and to 1e-3 by a moved stamp, whose wings the field cuts;
+    the centre of light moves by half a pixel to 0.05, and 1e-9 arcsec to either side of the corner make no difference
+    beyond 1e-6 of the peak.
     """
     observation = simulation.observation if kind == "exposures" else replace(simulation.observation, response=None)
     scale, (ny, nx) = observation.pixel_scale, observation.shape
