@@ -124,8 +124,10 @@ def scenes() -> list[str]:
     ):
         one = system(**given)
         simulation = sky(one)
-        made, found = cost(lambda one=one: sky(one)), cost(lambda simulation=simulation: fitted(simulation), 2)
-        layout, evidence, sampled = evaluated(simulation, fitted(simulation), Analysis(noise_treatment="diagonal"))
+        fits: list[ParametricFit] = []
+        made = cost(lambda one=one: sky(one), 2)
+        found = cost(lambda simulation=simulation, fits=fits: fits.append(fitted(simulation)), 2)
+        layout, evidence, sampled = evaluated(simulation, fits[0], Analysis(noise_treatment="diagonal"))
         costs = (made, found, layout, evidence)
         whole = whole or costs
         assert sampled == (9 if given.get("shear", True) else 7)

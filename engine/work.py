@@ -52,7 +52,7 @@ class Tally:
 
     def work(self) -> Work:
         """All of it so far."""
-        return Work(**self._counts)
+        return Work(**{str(name): number for name, number in self._counts.items()})
 
 
 @contextmanager

@@ -62,7 +62,8 @@ class ExposedOptics:
     def _drizzled(self, blurred: FloatArray) -> FloatArray:
         """Drizzled exposures of a blurred high-resolution image: by the weights, a fiftieth of the package's time."""
         exposures = expose(blurred, self.geometry, self.detector_kernel)
-        return (drizzle_weights(self.geometry) @ exposures.ravel()).reshape(self.geometry.drizzled_shape)
+        flat = drizzle_weights(self.geometry) @ exposures.ravel()
+        return np.asarray(flat.reshape(self.geometry.drizzled_shape))
 
     def blurring_matrix(self, to: Pixels, of: Pixels, subrays: int | None, radius: int) -> sparse.csr_matrix:
         """B (len(to), len(of)): each pixel's own PSF, dithers, drizzle and all."""
