@@ -169,8 +169,9 @@ def inversions() -> list[str]:
 HEAD = """# What a scene costs
 
 Written by `python -m benchmarks.scenes`: counts (pixels rendered, rays traced, columns solved) and CPU time, as ratios
-to the first line of each table in the same run. A fit of another scene takes another number of steps, a chain samples
-as many parameters as the last column says.
+to the first line of each table in the same run. A fit of another scene takes another number of steps, and without AGN
+images, which say where the lens is, it begins from more places: it costs more, not less. A chain samples as many
+parameters as the last column says.
 """
 
 
