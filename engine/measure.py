@@ -28,6 +28,7 @@ from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_f
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
+from engine.work import Work, counted
 
 MeasurementStatus = Literal["ok", "poor_fit"]
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
@@ -69,7 +70,7 @@ class ImageMeasurement:
     units of the map: a drizzled image has less noise in a pixel than its map says where the map allows for what
     neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is ``poor_fit`` where chi2_per_dof
     exceeds :data:`POOR_FIT`. ``inversion`` is None where none was asked for, or where it failed, which ``warnings``
-    then say.
+    then say. ``work`` counts all that was computed, that of an inversion that failed included.
     """
 
     host: Estimate
@@ -93,6 +94,7 @@ class ImageMeasurement:
     observation: Observation
     fit: ParametricFit
     inversion: SampledInversion | None
+    work: Work
 
     @property
     def estimator(self) -> str:
@@ -140,6 +142,7 @@ class ImageMeasurement:
             "profile": self.profile,
             "seed": self.seed,
             "seconds": self.seconds,
+            "work": asdict(self.work),
             "warnings": list(self.warnings),
             "versions": self.versions,
             "engine_digest": self.engine_digest,
@@ -260,16 +263,17 @@ def measure_image(
     warnings = [*observation.notes, *unlikely(observation, trusting=trust_options)]
     warnings += require_lens(observation, trusting=trust_options)
     rng = np.random.default_rng(seed)
-    found = analyse(
-        observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
-        shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
-    )  # fmt: skip
-    fit, orientation = found.fit, observation.orientation
-    if inversion:
-        try:
-            found = analyse(observation, analysis, rng, fit=fit, progress=progress)
-        except (PosteriorError, InversionError, ObservationError) as error:
-            warnings.append(f"inversion: {error}")
+    with counted() as tally:
+        found = analyse(
+            observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
+            shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
+        )  # fmt: skip
+        fit, orientation = found.fit, observation.orientation
+        if inversion:
+            try:
+                found = analyse(observation, analysis, rng, fit=fit, progress=progress)
+            except (PosteriorError, InversionError, ObservationError) as error:
+                warnings.append(f"inversion: {error}")
     residual = observation.image - fit.model
     measured = noise_scale(observation, residual, fit.sigma, fit.lens)
     if measured is None:
@@ -317,4 +321,5 @@ def measure_image(
         observation=observation,
         fit=fit,
         inversion=found.inversion,
+        work=tally.work(),
     )

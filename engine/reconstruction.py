@@ -45,6 +45,7 @@ from engine.result import (
 )
 from engine.spec.analysis import Analysis
 from engine.stages import Progress, Stopwatch
+from engine.work import Work, counted
 
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on it is said that the model does not describe the image."""
@@ -79,7 +80,10 @@ class SampledInversion:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What the analysis of an observation finds; ``inversion`` is None where no estimator needed one."""
+    """What the analysis of an observation finds; ``inversion`` is None where no estimator needed one.
+
+    ``work`` is what it took.
+    """
 
     observation: Observation
     analysis: Analysis
@@ -88,6 +92,7 @@ class Reconstruction:
     inversion: SampledInversion | None
     stages: tuple[StageTime, ...]
     warnings: tuple[str, ...]
+    work: Work
 
     @property
     def lens(self) -> tuple[LensParameter, ...]:
@@ -152,7 +157,7 @@ def analyse(
     """
     watch = Stopwatch(progress)
     # One thread: a worker is given one core, and sums in a fixed order give the same bits everywhere.
-    with threadpool_limits(1):
+    with threadpool_limits(1), counted() as tally:
         if fit is None:
             with watch.stage("parametric"):
                 fit = fit_parametric(
@@ -173,7 +178,9 @@ def analyse(
         )
     if analysis.max_error is not None:
         warnings += not_kept(estimates, analysis.max_error)
-    found = Reconstruction(observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings)
+    found = Reconstruction(
+        observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings, tally.work()
+    )  # fmt: skip
     told = [
         *warnings,
         *(undetected(one) for one in estimates if one.estimator == "image" and one.index_prior == "wide"),

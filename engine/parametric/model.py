@@ -29,6 +29,7 @@ from engine.parametric.constraints import constraints
 from engine.parametric.parameters import HOST_FLUX, ParameterSpace, lens_of
 from engine.parametric.shared_error import SharedError
 from engine.spec.priors import LensParameterName, ParameterPrior
+from engine.work import count
 
 RENDER_TOLERANCE = 1e-3
 _ANCHOR = 5e-4
@@ -203,6 +204,7 @@ class ImageModel:
         size = np.sqrt((seen**2).sum(axis=0))
         if not (size > 0).all():
             raise PosteriorError("parametric model: a component puts no light on the image")
+        count("columns_solved", size.size)
         scaled = seen / size
         best = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ self.data, rcond=1e-12)[0]
         return best / size, self.data - scaled @ best, columns

@@ -104,7 +104,7 @@ def _noise_excess(task: Task, solution: Solution) -> FloatArray:
     amplitudes, _, _ = model.amplitudes(solution.values)
     residual = observation.image - model.image(solution.values, amplitudes)
     scale = noise_scale(observation, residual, model.sigma, solution.lens) or 1.0
-    return np.where(observation.valid, (max(1.0, scale) ** 2 - 1.0) * observation.noise**2, 0.0)
+    return np.asarray((max(1.0, scale) ** 2 - 1.0) * np.where(observation.valid, observation.noise, 0.0) ** 2)
 
 
 def _full(

@@ -15,6 +15,7 @@ from service.domain.payload import (
     ESTIMATES,
     LENS_PARAMETERS,
     QUANTITIES,
+    WORK,
     ChainPayload,
     estimator_and_prior,
 )
@@ -45,7 +46,7 @@ ESTIMATE_COLUMNS = (
 _ESTIMATES = {name: estimator_and_prior(name) for name in ESTIMATES}
 _LENS = {name: tuple(f"lens_{name.lower()}_{part}" for part in ("mean", "sd", "truth")) for name in LENS_PARAMETERS}
 _CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
-_GATHERED = ("estimates", "aperture", "regularisation", "profile", "lens", "chain")
+_GATHERED = ("estimates", "aperture", "regularisation", "profile", "lens", "chain", "work")
 _PLAIN = tuple(name for name in ResultView.model_fields if name not in _GATHERED)
 
 
@@ -158,6 +159,7 @@ def _result(row: Row[Any], estimates: Sequence[Row[Any]]) -> dict[str, Any]:
         "profile": row.profile,
         "lens": lens,
         "chain": None if row.chain_status is None else {name: column[place] for name, place in _CHAIN.items()},
+        "work": _work(column),
         **{name: column[name] for name in _PLAIN},
     }
 
@@ -179,6 +181,12 @@ def _estimate(row: Row[Any]) -> dict[str, Any]:
             for quantity, whole, stages in ERROR_PARTS
         }
     return found
+
+
+def _work(column: RowMapping) -> dict[str, Any] | None:
+    if column["rays_traced"] is None:
+        return None
+    return {**{name: column[name] for name in WORK}, "evidence_evaluations": column["evaluations"] or 0}
 
 
 def _aperture(column: RowMapping) -> dict[str, Any] | None:
