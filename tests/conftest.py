@@ -15,7 +15,7 @@ from xdist.scheduler import LoadScopeScheduling  # noqa: E402
 from service.runtime.process import spare_collector  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
-LONG = ("tests/service/test_drills.py",)
+LONG = ("tests/service/test_drills.py", "tests/service/test_migrations.py", "tests/docs/test_examples.py")
 """Files that take long and whose tests share what is costly to make: begun before all others, each by one process."""
 APART = (
     "tests/test_end_to_end.py",
