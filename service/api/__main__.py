@@ -8,8 +8,11 @@ if __name__ == "__main__":
     start.begin()
     # Until everything is loaded; serve() turns it on again.
     gc.disable()
-    from service.api.serve import serve
-    from service.runtime.settings import read_settings
+    # Before what takes a second to load: a mistake is told at once.
+    from service.runtime.settings import Settings, read_settings
 
     with start.refusing():
-        serve(read_settings())
+        settings = read_settings(Settings)
+        from service.api.serve import serve
+
+        serve(settings)
