@@ -132,6 +132,7 @@ class ImageMeasurement:
             "chain": None if chain is None else asdict(chain),
             "inversion_chi2_per_dof": self.inversion_chi2_per_dof,
             "stamp_error": fit.stamp_error,
+            "model_error": _error_document(self),
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,
             "deflector": None if fit.deflector is None else asdict(fit.deflector),
@@ -161,6 +162,15 @@ def _document(value: Quantity) -> dict[str, Any]:
     return {"mean": value.mean, "sd": value.sd, "interval95": list(value.interval95)}
 
 
+def _error_document(found: ImageMeasurement) -> dict[str, Any] | None:
+    """What the model is wrong by, as far as the image shows it; the host with a model that is taken for exact."""
+    error = found.fit.error
+    if error is None:
+        return None
+    exact = rate_to_magnitude(error.flux_without, found.observation.zero_point) if error.flux_without > 0 else None
+    return {"psf": error.psf, "host": error.host, "ln_evidence": error.gain, "magnitude_if_exact": exact}
+
+
 def _host_document(found: Estimate) -> dict[str, Any]:
     values = {
         "magnitude": found.magnitude,
@@ -178,6 +188,18 @@ def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, sc
     used = np.isfinite(fit.sigma)
     variance = fit.sigma[used] ** 2 + (scale**2 - 1.0) * observation.noise[used] ** 2
     return float(np.sum(residual[used] ** 2 / variance))
+
+
+def _of_model(fit: ParametricFit) -> list[str]:
+    """What is said of a model that is not exact."""
+    if fit.error is None:
+        return []
+    told = []
+    if fit.error.psf > 0:
+        told.append(f"psf: by the AGN images the stamp is wrong by {fit.error.psf:.0%} of its light; corrected by them")
+    if fit.error.host > 0:
+        told.append(f"host: departs from its Sersic profile by {fit.error.host:.0%} of its light")
+    return [f"{one}; the errors hold what that leaves open" for one in told]
 
 
 def _by_name(parameters: Sequence[LensParameter]) -> dict[str, Quantity]:
@@ -263,6 +285,7 @@ def measure_image(
     warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
         warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
+    warnings += _of_model(fit)
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     status: MeasurementStatus = "ok"
     if chi2 > POOR_FIT:

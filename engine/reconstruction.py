@@ -155,6 +155,8 @@ def analyse(
                     observation, agn_images=agn_images, deflector=deflector, shear=shear, theta_E=theta_E,
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
                 )  # fmt: skip
+        if fit.error is not None:
+            observation = replace(observation, psf=fit.psf)
         inversion = _sample(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:
