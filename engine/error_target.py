@@ -57,7 +57,8 @@ def next_settings(settings: Analysis, estimates: Sequence[Estimate], max_error: 
         max_steps=PROFILES["reference"]["max_steps"],
     )  # fmt: skip
     found = _affordable(found)
-    return None if found == settings else found
+    # A walk that may be longer is no other one.
+    return None if replace(found, max_steps=settings.max_steps) == settings else found
 
 
 def not_kept(estimates: Sequence[Estimate], max_error: float) -> tuple[str, ...]:
