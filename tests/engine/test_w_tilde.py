@@ -9,9 +9,10 @@ from scipy import sparse
 from engine.errors import InversionError
 from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
+from engine.likelihood.curvature import curvature_matrix
 from engine.likelihood.evidence import ln_evidence
 from engine.likelihood.noise import factorise_noise
-from engine.likelihood.w_tilde import TILE, compute_w_tilde, curvature_matrix
+from engine.likelihood.w_tilde import TILE, compute_w_tilde
 from engine.source.lensing_matrix import LensingMatrix, cast_rays, map_rays
 from engine.source.regularisation import SourceModel
 from tests.engine.dense_oracle import LENS, SCALE
