@@ -87,9 +87,9 @@ def find_optimum(target: Target, start: FloatArray, covariance: FloatArray) -> L
 
     Each round measures gradient and second derivatives over one standard deviation (so that roughness of the evidence
     below that scale does not mislead), takes the Newton step of a negative definite version, shortened until it climbs,
-    and rescales the coordinates. Far from the maximum the mixed derivatives, most of the evaluations, are left out every
-    other time: the axes are those of the covariance. It ends with the step from less than two deviations away, measured with them: what
-    is left then is a tenth of that.
+    and rescales the coordinates. Far from the maximum the mixed derivatives, most of the evaluations, are left out
+    every other time: the axes are those of the covariance. It ends with a step from less than two deviations away,
+    measured with them: what is left then is a tenth of that.
 
     Raises
     ------

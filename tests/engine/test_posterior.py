@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
-from engine.likelihood.w_tilde import together
+from engine.likelihood.curvature import together
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
 from engine.posterior.proposal import StudentProposal
