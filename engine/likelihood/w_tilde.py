@@ -216,6 +216,7 @@ def compute_w_tilde(blurring: sparse.csr_matrix, noise: NoiseFactor, rays: RayBu
     """W = B^T C^-1 B for B (M, P), patch by patch, so that no matrix of M x M, M x P or P x P is ever made."""
     order = _patch_order(rays, blurring.shape[1])
     transposed = sparse.csr_matrix(blurring.T)[order]
+    transposed.sum_duplicates()
     p = order.size
     patches = -(-p // TILE)
     rows, columns = noise.rows(), np.ascontiguousarray(noise.bands.T)

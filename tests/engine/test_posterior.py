@@ -42,6 +42,16 @@ def test_the_optimum_of_a_gaussian_is_found_with_its_covariance() -> None:
     assert np.allclose(laplace.covariance, target.covariance, rtol=1e-5)
 
 
+def test_mixed_derivatives_are_measured_once_where_the_scale_is_about_right() -> None:
+    target, d = Gaussian(), 5
+    start = target.mean + np.linalg.cholesky(target.covariance) @ np.full(d, 0.8)
+    laplace = find_optimum(target, start, 2.0 * target.covariance)
+    assert np.allclose(laplace.mean, target.mean, atol=1e-6)
+    assert np.allclose(laplace.covariance, target.covariance, rtol=1e-5)
+    # The start; steps along the axes both ways and the trial, twice; the pairs of axes.
+    assert target.evaluations == 1 + 2 * (2 * d + 1) + d * (d - 1) // 2
+
+
 def test_the_chain_samples_a_gaussian_from_a_poor_approximation() -> None:
     target = Gaussian()
     poor = Laplace(target.mean + 0.5 * np.sqrt(np.diag(target.covariance)), 2.0 * target.covariance, 0.0, 1)

@@ -76,6 +76,29 @@ def test_the_blocks_hold_the_whole_of_w_and_leave_out_what_does_not_interact(cor
     assert likelihood.w_tilde.blocks.shape[0] < (0.7 if correlation == 0.0 else 1.01) * patches * (patches + 1) / 2
 
 
+def test_under_a_covariance_only_what_is_next_to_nothing_is_left_out() -> None:
+    # A strip ten times as long as light and the inverse of the covariance reach, so that both substitutions end early.
+    shape, rng = (150, 6), np.random.default_rng(5)
+    lit = np.ones(shape, dtype=bool)
+    axes = (np.arange(size) * SCALE for size in shape[::-1])
+    rays = cast_rays(lit, np.zeros(shape, dtype=bool), *axes, SCALE, 1)
+    blurring = blurring_matrix(rng.uniform(0.5, 1.0, (5, 5)), np.nonzero(lit), np.nonzero(lit))
+    near = np.full((3, 3), 0.05)
+    near[1, 1] = 1.0
+    # Pixels that are left out by their noise are as quiet as the end of a substitution, and are none.
+    deviations = sparse.diags(np.where(np.arange(lit.size) % 7 == 0, 1e18, rng.uniform(0.8, 1.2, lit.size)))
+    noise = factorise_noise(deviations @ blurring_matrix(near, np.nonzero(lit), np.nonzero(lit)) @ deviations)
+    w_tilde = compute_w_tilde(blurring, noise, rays)
+    white = noise.whiten(blurring.toarray())
+    plain = white.T @ white
+    scale = np.sqrt(np.diag(plain))
+    # Entries below 1e-12 of their diagonals may be missing; the plain matrix rounds by less than that.
+    assert (np.abs(w_tilde.dense() - plain) / np.outer(scale, scale)).max() < 1.1e-12
+    patches = w_tilde.start.size - 1
+    assert w_tilde.blocks.shape[0] < 0.5 * patches * (patches + 1) / 2
+    assert w_tilde.blocks.ctypes.data % 64 == 0
+
+
 def test_a_column_of_the_blurring_that_is_no_pixel_takes_part_in_the_evidence() -> None:
     without, likelihood = ring_likelihood(0.0, 2), ring_likelihood(0.0, 2, extra=1)
     mapping = map_rays(without.rays, LENS_HERE, (9, 9))
