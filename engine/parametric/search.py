@@ -48,7 +48,8 @@ class Acceptance:
 class Task:
     """What is fitted: an observation, what the model may have, and what is known.
 
-    ``shear`` is None where the fit has to tell whether there is any.
+    ``shear`` is None where the fit has to tell whether there is any. ``given`` (n, n) is the stamp of the PSF that the
+    observation came with, where it has another one by now; else None.
     """
 
     observation: Observation
@@ -56,6 +57,7 @@ class Task:
     shear: bool | None
     acceptance: Acceptance
     priors: Mapping[LensParameterName, ParameterPrior]
+    given: FloatArray | None = None
 
     @cached_property
     def image(self) -> FloatArray:
