@@ -179,8 +179,7 @@ def read_external_observation(
         record |= recorded(found.readings)
         return observed(psf=binned(stamp, factor), provenance=record, notes=tuple(found.notes))
     except ObservationError as error:
-        role = str(error).partition(":")[0]
-        raise ObservationError(f"{files.get(role) or image}: {error}") from error
+        raise ObservationError(f"{files.get(str(error).partition(':')[0]) or image}: {error}") from error
 
 
 def _science(

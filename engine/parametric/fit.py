@@ -8,13 +8,13 @@ whole of it (:mod:`.refine`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
 
 from engine.conventions import FloatArray
-from engine.errors import ObservationError, PosteriorError, SpecError
+from engine.errors import PosteriorError, SpecError
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, profile_of
@@ -23,7 +23,6 @@ from engine.parametric.host_posterior import HostPosterior
 from engine.parametric.model import ImageModel
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX
 from engine.parametric.point_sources import Detection
-from engine.parametric.psf_start import stamp_of_images
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
 from engine.parametric.shared_error import ModelError
@@ -35,10 +34,6 @@ from engine.spec.priors import LensParameterName, ParameterPrior
 __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametric"]
 
 GOOD_START = Acceptance()
-_FAR_OFF = 1.5
-"""chi^2 per degree of freedom from which on the stamp of the PSF may be too far off to begin a fit with."""
-_STARS = 4
-"""The brightest point sources that are taken for AGN images as long as nothing else is known."""
 
 
 @dataclass(frozen=True)
@@ -126,28 +121,6 @@ def fit_parametric(
     if theta_E is not None and not 0 < theta_E < radius:
         raise SpecError("theta_E", theta_E, f"a radius on the image, below {radius:g}")
     task = Task(observation, deflector, shear, acceptance, priors)
-    hints = agn_images, theta_E, positions, fixed_index
-    try:
-        first = _found(task, *hints)
-    except PosteriorError:
-        second = _with_stamp_of_images(task, *hints)
-        if second is None:
-            raise
-        return second
-    if not observation.optics.misfit_is_noise or len(first.agn) < 2 or first.misfit < _FAR_OFF:
-        return first
-    second = _with_stamp_of_images(task, *hints)
-    return first if second is None or second.misfit > first.misfit else second
-
-
-def _found(
-    task: Task,
-    agn_images: int | None,
-    theta_E: float | None,
-    positions: Sequence[tuple[float, float]] | None,
-    fixed_index: float | None,
-) -> ParametricFit:
-    """The first acceptable fit of a task."""
     groups = find_starts(task, agn_images, theta_E, positions)
     refusals: list[str] = []
     for wave in (groups, [varied_starts(group) for group in groups]):
@@ -157,27 +130,6 @@ def _found(
             except PosteriorError as error:
                 refusals.append(str(error))
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
-
-
-def _with_stamp_of_images(
-    task: Task,
-    agn_images: int | None,
-    theta_E: float | None,
-    positions: Sequence[tuple[float, float]] | None,
-    fixed_index: float | None,
-) -> ParametricFit | None:
-    """The fit that begins with the stamp which the AGN images have in common; None where there is none."""
-    seen = task.observation
-    if not seen.optics.misfit_is_noise:
-        return None
-    psf = stamp_of_images(seen, task.candidates(agn_images or _STARS))
-    if psf is None:
-        return None
-    begun = replace(task, observation=replace(seen, psf=psf), given=seen.psf)
-    try:
-        return _found(begun, agn_images, theta_E, positions, fixed_index)
-    except (PosteriorError, ObservationError):
-        return None
 
 
 def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> ParametricFit:

@@ -18,7 +18,7 @@ from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.residual_noise import measured_stamp_error, noise_scale
 from engine.parametric.search import Task, agn_light
-from engine.parametric.shared_error import ModelError, SharedError
+from engine.parametric.shared_error import SharedError
 from engine.parametric.solution import NEAR_STEPS, TOLERANCE, Solution, minimise
 from engine.parametric.uncertainty import parameter_covariance
 
@@ -84,9 +84,7 @@ def polished(task: Task, solution: Solution) -> Solution:
 
 def _with_model_error(task: Task, solution: Solution) -> Solution:
     """The fit with the errors of the model that it shows marginalised, and the stamp corrected."""
-    given, known = task.observation.psf, None
-    if task.given is not None:
-        given, known = task.given, ModelError(0.0, 0.0, 0.0, task.observation.psf - task.given, solution.host_flux)
+    given, known = task.observation.psf, solution.error
     for _ in range(_ROUNDS):
         stamps, extended = _variances(task, solution)
         base = weights_sigma(task.observation, extended + _noise_excess(task, solution))

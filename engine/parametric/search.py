@@ -48,8 +48,7 @@ class Acceptance:
 class Task:
     """What is fitted: an observation, what the model may have, and what is known.
 
-    ``shear`` is None where the fit has to tell whether there is any. ``given`` (n, n) is the stamp of the PSF that the
-    observation came with, where it has another one by now; else None.
+    ``shear`` is None where the fit has to tell whether there is any.
     """
 
     observation: Observation
@@ -57,7 +56,6 @@ class Task:
     shear: bool | None
     acceptance: Acceptance
     priors: Mapping[LensParameterName, ParameterPrior]
-    given: FloatArray | None = None
 
     @cached_property
     def image(self) -> FloatArray:
