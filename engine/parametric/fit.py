@@ -35,7 +35,7 @@ __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametri
 
 GOOD_START = Acceptance()
 _DOUBTFUL = 1.5
-"""chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: other starts are tried as well."""
+"""chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
 
 
 @dataclass(frozen=True)
