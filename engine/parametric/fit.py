@@ -36,6 +36,8 @@ __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametri
 
 GOOD_START = Acceptance()
 _N = COORDINATES.index("n")
+_DOUBTFUL = 1.5
+"""chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
 
 
 @dataclass(frozen=True)
@@ -125,13 +127,21 @@ def fit_parametric(
         raise SpecError("theta_E", theta_E, f"a radius on the image, below {radius:g}")
     task = Task(observation, deflector, shear, acceptance, priors)
     groups = find_starts(task, agn_images, theta_E, positions)
+    best: ParametricFit | None = None
     refusals: list[str] = []
     for wave in (groups, [varied_starts(group) for group in groups]):
         for solution in ranked(task, [quick_fits(task, group) for group in wave]):
             try:
-                return fit_of(task, polished(task, solution), fixed_index)
+                found = fit_of(task, polished(task, solution), fixed_index)
             except PosteriorError as error:
                 refusals.append(str(error))
+                continue
+            if found.misfit < _DOUBTFUL:
+                return found
+            if best is None or found.misfit < best.misfit:
+                best = found
+    if best is not None:
+        return best
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
 
 
