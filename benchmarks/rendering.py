@@ -22,6 +22,7 @@ from lenstronomy.Util.param_util import phi_q2_ellipticity
 
 from benchmarks import peers
 from benchmarks.timing import least
+from engine.accuracy.light_reference import flux_through_the_sides, graded_fluxes
 from engine.conventions import pixel_centres
 from engine.lensing.power_law import PowerLawLens, deflection
 from engine.light.rendering import render_sersic, sample_sersic
@@ -30,7 +31,6 @@ from engine.simulation.scene import build_scene
 from engine.simulation.simulate import scene_geometry, simulate
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
-from tests.engine.light_oracle import flux_through_the_sides, graded_fluxes
 
 LENS = PowerLawLens(1.2171, 0.85, 1.29, 2.0)
 PIXELS, SCALE = 100, 0.08

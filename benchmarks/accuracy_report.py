@@ -1,0 +1,179 @@
+"""Speed against error of every knob, for all eight systems: docs/tables/speed_against_error.md, its data and figure.
+
+    python -m benchmarks.accuracy_report [--systems HE0435 ...] [--stages rendering ...]
+
+The same as ``hostlens accuracy SYSTEM`` of each system, and PyAutoLens on the axes of the rendering where
+``python -m benchmarks.peers`` has prepared it. Systems and stages that are not measured keep what the data hold of
+them. Three to ten CPU minutes a system.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import peers
+from engine import (
+    ACCURACY_STAGES,
+    AccuracyReport,
+    accuracy_page,
+    engine_digest,
+    hardest_realization,
+    measure_accuracy,
+    report_from_dict,
+    system_names,
+)
+from engine.accuracy.curves import Point
+from engine.accuracy.peers import effective_brightness
+from engine.accuracy.rendering import INTEGRATION, PEER_SUBPIXELS, HostImage, uniform
+from engine.accuracy.subject import Subject
+from engine.conventions import FloatArray
+from engine.figures import accuracy_figure, figure_bytes
+from engine.lensing.power_law import PowerLawLens, deflection
+from engine.light.sersic import SersicProfile
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+PAGE, DATA = DOCS / "tables" / "speed_against_error.md", DOCS / "tables" / "speed_against_error.json"
+FIGURE = DOCS / "images" / "speed_against_error.svg"
+_PROBE = (1.0, 0.3)
+_SAME = 1e-3
+"""Part of the brightest pixel by which an image of the same rays may differ: conventions are then the same."""
+
+
+def autolens_images(
+    profile: SersicProfile, lens: PowerLawLens, pixels: int, scale: float, subpixels: tuple[int, ...]
+) -> list[tuple[FloatArray, float]]:
+    """PyAutoLens' image (pixels, pixels) of a lensed host and its CPU seconds, for each number of rays along a pixel.
+
+    For an isothermal lens at the origin without shear; PyAutoLens runs in an environment of its own.
+    """
+    python = peers.interpreter("autolens")
+    if python is None:
+        raise FileNotFoundError(peers.missing("autolens"))
+    bent = deflection(lens, np.array([_PROBE[0]]), np.array([_PROBE[1]]))
+    with tempfile.TemporaryDirectory() as folder:
+        scene = {
+            "lens_q": lens.q,
+            "lens_phi": lens.phi,
+            "probe": _PROBE,
+            "deflection": [float(component[0]) for component in bent],
+            **dataclasses.asdict(profile),
+            "intensity": profile.flux * effective_brightness(profile),
+            "subpixels": list(subpixels),
+            "pixels": pixels,
+            "scale": scale,
+            "folder": folder,
+        }
+        done = subprocess.run(
+            [str(python), str(Path(peers.__file__).with_name("autolens_rendering.py")), json.dumps(scene)],
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=folder,
+            env={**os.environ, "PYAUTO_SKIP_WORKSPACE_VERSION_CHECK": "1"},
+        )
+        runs = json.loads(done.stdout.splitlines()[-1])["runs"]
+        return [(np.load(run["image"]), run["seconds"]) for run in runs]
+
+
+def autolens_points(subject: Subject) -> list[Point]:
+    """PyAutoLens beside the rendering of a subject; none where its script does not know such a lens."""
+    image = HostImage(subject)
+    lens, host = image.lens, image.host
+    if (lens.slope, lens.x, lens.y, lens.gamma1, lens.gamma2) != (2.0, 0.0, 0.0, 0.0, 0.0):
+        return []
+    found = []
+    theirs = autolens_images(host, lens, image.x.size, image.scale, PEER_SUBPIXELS)
+    for subpixels, (pixels, seconds) in zip(PEER_SUBPIXELS, theirs, strict=True):
+        same = np.abs(pixels - uniform(host, lens, image.x, image.y, image.scale, subpixels)).max() / pixels.max()
+        assert same < _SAME, (subpixels, same)
+        found.append(Point(f"{subpixels} x {subpixels}", seconds, image.error(pixels), peer="PyAutoLens"))
+    return found
+
+
+def with_autolens(report: AccuracyReport, subject: Subject) -> AccuracyReport:
+    """The report with PyAutoLens' points, where it is prepared."""
+    if peers.interpreter("autolens") is None:
+        return report
+    points = tuple(autolens_points(subject))
+    curves = tuple(
+        dataclasses.replace(curve, points=curve.points + points) if curve.knob == INTEGRATION else curve
+        for curve in report.curves
+    )
+    absent = tuple(peer for peer in report.absent if peer != "PyAutoLens")
+    return dataclasses.replace(report, curves=curves, absent=absent)
+
+
+def joined(former: AccuracyReport | None, report: AccuracyReport) -> AccuracyReport:
+    """A report with the curves that only a former one has, in the order of the stages."""
+    if former is None:
+        return report
+    measured = {curve.knob.stage for curve in report.curves}
+    curves = [*report.curves, *(curve for curve in former.curves if curve.knob.stage not in measured)]
+    curves.sort(key=lambda curve: ACCURACY_STAGES.index(curve.knob.stage))
+    return dataclasses.replace(report, curves=tuple(curves))
+
+
+def read_reports() -> dict[str, AccuracyReport]:
+    """What the data hold, by system in the catalogue's order."""
+    if not DATA.exists():
+        return {}
+    held = {entry["system"]: report_from_dict(entry) for entry in json.loads(DATA.read_text())["systems"]}
+    return {system: held[system] for system in system_names() if system in held}
+
+
+def heading(reports: dict[str, AccuracyReport], digest: str) -> str:
+    """What stands above the tables."""
+    absent = sorted({peer for report in reports.values() for peer in report.absent})
+    missing = "".join(f" {peer} was not installed." for peer in absent)
+    return f"""# Speed against error
+
+Written by `python -m benchmarks.accuracy_report`; `hostlens accuracy SYSTEM` measures one system. The paper's host of
+n = 4 with the smaller radius and the second brightest magnitude, l_eta = 1, seed 0. Errors are against references made
+another way and are the same each time; CPU time is of one thread, in units of the default's, the median over the
+systems. **Bold** is the default; `on the front` counts the systems in which no other setting of ours is better in one
+and no worse in the other. PyAutoLens is shown where the lens has no shear.{missing} Engine `{digest}`.
+
+![Speed against error of every knob](../images/speed_against_error.svg)
+"""
+
+
+def write(reports: dict[str, AccuracyReport]) -> None:
+    """Page, data and figure."""
+    digest = engine_digest()[:12]
+    document = {"engine": digest, "systems": [report.to_dict() for report in reports.values()]}
+    DATA.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    shown = list(reports.values())
+    PAGE.write_text(heading(reports, digest) + accuracy_page(shown), encoding="utf-8")
+    FIGURE.write_bytes(figure_bytes(accuracy_figure(shown), "svg"))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--systems", nargs="+", default=list(system_names()), choices=system_names())
+    parser.add_argument("--stages", nargs="+", default=list(ACCURACY_STAGES), choices=ACCURACY_STAGES)
+    given = parser.parse_args()
+    for system in given.systems:
+        began, realization = time.process_time(), hardest_realization(system)
+        report = measure_accuracy(realization, given.stages)
+        if INTEGRATION.stage in given.stages:
+            report = with_autolens(report, Subject(realization))
+        reports = read_reports()
+        reports[system] = joined(reports.get(system), report)
+        write({name: reports[name] for name in system_names() if name in reports})
+        off = [curve.knob.name for curve in report.curves if not curve.default_on_front]
+        print(
+            f"{system}: {time.process_time() - began:.0f} CPU s; off the front: {', '.join(off) or 'none'}", flush=True
+        )
+
+
+if __name__ == "__main__":
+    main()
