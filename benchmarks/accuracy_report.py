@@ -1,6 +1,6 @@
 """Speed against error of every knob, for all eight systems: docs/tables/speed_against_error.md, its data and figure.
 
-    python -m benchmarks.accuracy_report [--systems HE0435 ...] [--stages rendering ...]
+    python -m benchmarks.accuracy_report [--systems HE0435 ...] [--stages rendering ...] [--write]
 
 The same as ``hostlens accuracy SYSTEM`` of each system, and PyAutoLens on the axes of the rendering where
 ``python -m benchmarks.peers`` has prepared it. Systems and stages that are not measured keep what the data hold of
@@ -34,6 +34,7 @@ from engine import (
 from engine.accuracy.curves import Point
 from engine.accuracy.peers import effective_brightness
 from engine.accuracy.rendering import INTEGRATION, PEER_SUBPIXELS, HostImage, uniform
+from engine.accuracy.report import accuracy_knobs
 from engine.accuracy.subject import Subject
 from engine.conventions import FloatArray
 from engine.figures import accuracy_figure, figure_bytes
@@ -122,57 +123,70 @@ def joined(former: AccuracyReport | None, report: AccuracyReport) -> AccuracyRep
     return dataclasses.replace(report, curves=tuple(curves))
 
 
-def read_reports() -> dict[str, AccuracyReport]:
-    """What the data hold, by system in the catalogue's order."""
+def read_reports() -> tuple[dict[str, AccuracyReport], dict[str, str]]:
+    """What the data hold, and the engine that it was measured of, by system."""
     if not DATA.exists():
-        return {}
-    held = {entry["system"]: report_from_dict(entry) for entry in json.loads(DATA.read_text())["systems"]}
-    return {system: held[system] for system in system_names() if system in held}
+        return {}, {}
+    document = json.loads(DATA.read_text())
+    return {entry["system"]: report_from_dict(entry) for entry in document["systems"]}, document["engines"]
 
 
-def heading(reports: dict[str, AccuracyReport], digest: str) -> str:
+def as_described(report: AccuracyReport) -> AccuracyReport:
+    """The report with the descriptions that the code has now."""
+    known = {(knob.stage, knob.name): knob for knob in accuracy_knobs()}
+    curves = tuple(dataclasses.replace(curve, knob=known[curve.knob.stage, curve.knob.name]) for curve in report.curves)
+    return dataclasses.replace(report, curves=curves)
+
+
+def heading(reports: dict[str, AccuracyReport], engines: dict[str, str]) -> str:
     """What stands above the tables."""
     absent = sorted({peer for report in reports.values() for peer in report.absent})
     missing = "".join(f" {peer} was not installed." for peer in absent)
+    made = ", ".join(f"`{digest}`" for digest in dict.fromkeys(engines.values()))
     return f"""# Speed against error
 
 Written by `python -m benchmarks.accuracy_report`; `hostlens accuracy SYSTEM` measures one system. The paper's host of
 n = 4 with the smaller radius and the second brightest magnitude, l_eta = 1, seed 0. Errors are against references made
 another way and are the same each time; CPU time is of one thread, in units of the default's, the median over the
 systems. **Bold** is the default; `on the front` counts the systems in which no other setting of ours is better in one
-and no worse in the other. PyAutoLens is shown where the lens has no shear.{missing} Engine `{digest}`.
+and no worse in the other. PyAutoLens is shown where the lens has no shear.{missing} Engine {made}.
 
 ![Speed against error of every knob](../images/speed_against_error.svg)
 """
 
 
-def write(reports: dict[str, AccuracyReport]) -> None:
+def write(reports: dict[str, AccuracyReport], engines: dict[str, str]) -> None:
     """Page, data and figure."""
-    digest = engine_digest()[:12]
-    document = {"engine": digest, "systems": [report.to_dict() for report in reports.values()]}
+    shown = {system: as_described(reports[system]) for system in system_names() if system in reports}
+    document = {
+        "engines": {system: engines[system] for system in shown},
+        "systems": [report.to_dict() for report in shown.values()],
+    }
     DATA.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    shown = list(reports.values())
-    PAGE.write_text(heading(reports, digest) + accuracy_page(shown), encoding="utf-8")
-    FIGURE.write_bytes(figure_bytes(accuracy_figure(shown), "svg"))
+    page = heading(shown, document["engines"]) + accuracy_page(list(shown.values()))
+    PAGE.write_text(page, encoding="utf-8")
+    FIGURE.write_bytes(figure_bytes(accuracy_figure(list(shown.values())), "svg"))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--systems", nargs="+", default=list(system_names()), choices=system_names())
     parser.add_argument("--stages", nargs="+", default=list(ACCURACY_STAGES), choices=ACCURACY_STAGES)
+    parser.add_argument("--write", action="store_true", help="measure nothing")
     given = parser.parse_args()
-    for system in given.systems:
+    for system in () if given.write else given.systems:
         began, realization = time.process_time(), hardest_realization(system)
         report = measure_accuracy(realization, given.stages)
         if INTEGRATION.stage in given.stages:
             report = with_autolens(report, Subject(realization))
-        reports = read_reports()
-        reports[system] = joined(reports.get(system), report)
-        write({name: reports[name] for name in system_names() if name in reports})
+        reports, engines = read_reports()
+        reports[system], engines[system] = joined(reports.get(system), report), engine_digest()[:12]
+        write(reports, engines)
         off = [curve.knob.name for curve in report.curves if not curve.default_on_front]
-        print(
-            f"{system}: {time.process_time() - began:.0f} CPU s; off the front: {', '.join(off) or 'none'}", flush=True
-        )
+        told = f"{system}: {time.process_time() - began:.0f} CPU s"
+        print(f"{told}; off the front: {', '.join(off) or 'none'}", flush=True)
+    if given.write:
+        write(*read_reports())
 
 
 if __name__ == "__main__":

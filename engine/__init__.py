@@ -64,19 +64,13 @@ from engine.spec.realization import (
 )
 from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
-from engine.stages import STAGES
+from engine.stages import ACCURACY_STAGES, STAGES
 from engine.user_files import read_camera, read_mapping, read_system
 
 if TYPE_CHECKING:
     from engine.acceptance import check_realization
     from engine.accuracy.curves import AccuracyReport, report_from_dict
-    from engine.accuracy.report import (
-        ACCURACY_STAGES,
-        accuracy_markdown,
-        accuracy_page,
-        accuracy_rows,
-        measure_accuracy,
-    )
+    from engine.accuracy.report import accuracy_markdown, accuracy_page, accuracy_rows, measure_accuracy
     from engine.accuracy.subject import hardest_realization
     from engine.biases import (
         BIN_WIDTH,
@@ -120,7 +114,7 @@ else:
     _LATE = {
         "engine.acceptance": "check_realization",
         "engine.accuracy.curves": "AccuracyReport report_from_dict",
-        "engine.accuracy.report": ("ACCURACY_STAGES accuracy_markdown accuracy_page accuracy_rows measure_accuracy"),
+        "engine.accuracy.report": "accuracy_markdown accuracy_page accuracy_rows measure_accuracy",
         "engine.accuracy.subject": "hardest_realization",
         "engine.biases": (
             "BIN_WIDTH GROUPINGS HOST_QUANTITIES TRENDS BiasPoint Configuration CoverageCurve Grouping "

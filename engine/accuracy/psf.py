@@ -38,7 +38,7 @@ WAVELENGTHS = Knob(
     quantity=_QUANTITY,
     unit=_UNIT,
     work="the PSF, once a process",
-    reference="100 even wavelengths over the same band, the throughput interpolated",
+    reference="50 even wavelengths over the same band, the throughput interpolated",
 )
 PUPIL = Knob(
     stage=STAGE,
@@ -50,7 +50,7 @@ PUPIL = Knob(
     reference="1,024 pixels across the pupil",
 )
 _SIDES = (1.2, 2.4, 4.0, 6.0, 8.0, STAMP_SIDE, 14.0)
-_MANY_WAVELENGTHS, _FINE_PUPIL = 100, 1024
+_MANY_WAVELENGTHS, _FINE_PUPIL = 50, 1024
 _PART = 4.0
 """Side [arcsec] of the stamps that wavelengths and pupil are measured by: further out all of it is fainter."""
 

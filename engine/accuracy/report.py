@@ -9,16 +9,21 @@ from types import ModuleType
 from threadpoolctl import threadpool_limits
 
 from engine.accuracy import cusps, deflection, draws, drizzling, noise, peers, psf, rendering, sampling, source
-from engine.accuracy.curves import AccuracyReport, Curve, Point, by_knob
+from engine.accuracy.curves import AccuracyReport, Curve, Knob, Point, by_knob
 from engine.accuracy.subject import Subject
 from engine.errors import SpecError
 from engine.spec.realization import Realization
+from engine.stages import ACCURACY_STAGES
 
 _MODULES: tuple[ModuleType, ...] = (
     deflection, rendering, cusps, psf, drizzling, noise, source, sampling, draws,
 )  # fmt: skip
-ACCURACY_STAGES: tuple[str, ...] = tuple(module.STAGE for module in _MODULES)
-"""Stages that a report has, in the order of a run."""
+
+
+def accuracy_knobs() -> tuple[Knob, ...]:
+    """What is measured, in the order of the stages."""
+    found = [value for module in _MODULES for value in vars(module).values() if isinstance(value, Knob)]
+    return tuple(dict.fromkeys(found))
 
 
 def measure_accuracy(
@@ -33,7 +38,7 @@ def measure_accuracy(
     realization : Realization
         The scene, and by its analysis the defaults; :func:`~engine.accuracy.subject.hardest_realization` is usual.
     stages : sequence of str
-        Of :data:`ACCURACY_STAGES`.
+        Of :data:`~engine.stages.ACCURACY_STAGES`.
     progress : callable, optional
         Told each stage when it ends.
 

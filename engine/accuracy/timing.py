@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from engine.accuracy.curves import Curve, Knob, Point, Refusal
 from engine.errors import EngineError
 
-_REPETITIONS, _ENOUGH_SECONDS = 15, 0.5
+_REPETITIONS, _ENOUGH_SECONDS = 15, 0.2
 
 
 def least_cpu(work: Callable[[], object]) -> float:

@@ -36,12 +36,14 @@ def accuracy(
     for path, allowed in outputs:
         require_file(path, allowed)
     with refusals():
-        from engine import ACCURACY_STAGES, SpecError, hardest_realization, load_system, measure_accuracy  # noqa: PLC0415
+        from engine import ACCURACY_STAGES, SpecError, load_system  # noqa: PLC0415 - as pictures
 
         load_system(system)
         stages = ACCURACY_STAGES if stage is None else (stage,)
         if not set(stages) <= set(ACCURACY_STAGES):
             raise SpecError("stage", stage, f"one of {', '.join(ACCURACY_STAGES)}")
+        from engine import hardest_realization, measure_accuracy  # noqa: PLC0415 - after all that may be refused
+
         with progress_bar(f"measuring {system}", len(stages)) as advance:
             report = measure_accuracy(hardest_realization(system), stages, lambda _: advance())
     _tell(report)
