@@ -117,10 +117,11 @@ def joined(former: AccuracyReport | None, report: AccuracyReport) -> AccuracyRep
     """A report with the curves that only a former one has, in the order of the stages."""
     if former is None:
         return report
-    measured = {curve.knob.stage for curve in report.curves}
+    measured = {curve.knob.stage for curve in report.curves} | {one.setting for one in report.refused}
     curves = [*report.curves, *(curve for curve in former.curves if curve.knob.stage not in measured)]
     curves.sort(key=lambda curve: ACCURACY_STAGES.index(curve.knob.stage))
-    return dataclasses.replace(report, curves=tuple(curves))
+    refused = [*report.refused, *(one for one in former.refused if one.setting not in measured)]
+    return dataclasses.replace(report, curves=tuple(curves), refused=tuple(refused))
 
 
 def read_reports() -> tuple[dict[str, AccuracyReport], dict[str, str]]:

@@ -101,12 +101,16 @@ def pareto_front(points: Iterable[Point], floor: float = 0.0) -> tuple[Point, ..
 
 @dataclass(frozen=True)
 class AccuracyReport:
-    """The curves of a system, in the order of the stages; ``absent`` names peers that are not installed."""
+    """The curves of a system, in the order of the stages.
+
+    ``absent`` names peers that are not installed, ``refused`` the stages that cannot be measured here, and why.
+    """
 
     system: str
     scene: str
     curves: tuple[Curve, ...]
     absent: tuple[str, ...] = ()
+    refused: tuple[Refusal, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form, with the ratio of each cost to the default's; :func:`report_from_dict` reads it back."""
@@ -117,7 +121,13 @@ class AccuracyReport:
                 {**asdict(point), "ratio": curve.ratio(point), "on_front": point in front} for point in curve.points
             ]
             curves.append({**asdict(curve), "points": points, "default_on_front": curve.default_on_front})
-        return {"system": self.system, "scene": self.scene, "absent": list(self.absent), "curves": curves}
+        return {
+            "system": self.system,
+            "scene": self.scene,
+            "absent": list(self.absent),
+            "refused": [asdict(refusal) for refusal in self.refused],
+            "curves": curves,
+        }
 
 
 def report_from_dict(document: dict[str, Any]) -> AccuracyReport:
@@ -138,6 +148,7 @@ def report_from_dict(document: dict[str, Any]) -> AccuracyReport:
             for entry in document["curves"]
         ),
         tuple(document["absent"]),
+        tuple(Refusal(**found) for found in document["refused"]),
     )
 
 

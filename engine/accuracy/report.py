@@ -9,9 +9,9 @@ from types import ModuleType
 from threadpoolctl import threadpool_limits
 
 from engine.accuracy import cusps, deflection, draws, drizzling, noise, peers, psf, rendering, sampling, source
-from engine.accuracy.curves import AccuracyReport, Curve, Knob, Point, by_knob
+from engine.accuracy.curves import AccuracyReport, Curve, Knob, Point, Refusal, by_knob
 from engine.accuracy.subject import Subject
-from engine.errors import SpecError
+from engine.errors import EngineError, SpecError
 from engine.spec.realization import Realization
 from engine.stages import ACCURACY_STAGES
 
@@ -47,20 +47,31 @@ def measure_accuracy(
     SpecError
         There is no such stage.
     EngineError
-        The scene cannot be simulated or analysed; the message says why.
+        The scene cannot be simulated, or no stage can be measured; the message says why.
     """
     for stage in stages:
         if stage not in ACCURACY_STAGES:
             raise SpecError("stage", stage, f"one of {', '.join(ACCURACY_STAGES)}")
-    subject, curves = Subject(realization), []
+    subject, curves, errors = Subject(realization), [], {}
     with threadpool_limits(1):
         for module in _MODULES:
-            if module.STAGE in stages:
+            if module.STAGE not in stages:
+                continue
+            try:
                 curves += module.measure(subject)
-                if progress is not None:
-                    progress(module.STAGE)
-    absent = tuple(peer for peer in peers.PEERS if not peers.installed(peer))
-    return AccuracyReport(realization.system_name, subject.told, tuple(curves), absent)
+            except EngineError as error:
+                errors[module.STAGE] = error
+            if progress is not None:
+                progress(module.STAGE)
+    if errors and not curves:
+        raise next(iter(errors.values()))
+    return AccuracyReport(
+        system=realization.system_name,
+        scene=subject.told,
+        curves=tuple(curves),
+        absent=tuple(peer for peer in peers.PEERS if not peers.installed(peer)),
+        refused=tuple(Refusal(stage, str(error)) for stage, error in errors.items()),
+    )
 
 
 def _name(point: Point) -> str:
@@ -89,6 +100,7 @@ def accuracy_markdown(report: AccuracyReport) -> str:
     """The report of one system as Markdown."""
     lines = [f"# Speed against error: {report.system}", "", f"{report.scene}.", ""]
     lines += [f"{peer} is not installed here." for peer in report.absent]
+    lines += [f"Not measured: {refusal.setting}: {refusal.reason}." for refusal in report.refused]
     for curve in report.curves:
         lines += ["", f"## {curve.knob.stage}: {curve.knob.name}", "", *_about(curve)]
         lines += ["| setting | CPU, of the default's | error | |", "|---|---|---|---|"]
@@ -101,7 +113,11 @@ def accuracy_markdown(report: AccuracyReport) -> str:
 
 def accuracy_page(reports: Sequence[AccuracyReport]) -> str:
     """The reports of several systems as the body of a page: a table for each knob, medians and errors of each."""
-    lines: list[str] = []
+    lines = [
+        f"Not measured in {report.system}: {refusal.setting}: {refusal.reason}."
+        for report in reports
+        for refusal in report.refused
+    ]
     for (stage, name), found in by_knob(reports).items():
         curves = [curve for _, curve in found]
         knob = curves[0].knob

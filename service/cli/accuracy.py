@@ -61,6 +61,8 @@ def _tell(report: AccuracyReport) -> None:
     out.print(report.scene, markup=False)
     for peer in report.absent:
         out.print(f"{peer} is not installed here", markup=False)
+    for refusal in report.refused:
+        out.print(f"not measured: {refusal.setting}: {refusal.reason}", markup=False)
     for curve in report.curves:
         knob = curve.knob
         table = Table(title=f"{knob.stage}: {knob.name}", title_justify="left")

@@ -97,7 +97,8 @@ def test_a_setting_that_the_engine_refuses_is_told_and_not_measured() -> None:
 
 def some_report(system: str) -> AccuracyReport:
     points = (point(1.0, 1.0, "a", default=True), point(0.5, 0.5, "b"), point(9.0, 0.0, "c", peer="lenstronomy"))
-    return AccuracyReport(system, "scene", (Curve(KNOB, 1e-3, points, (Refusal("d", "why"),)),), ("PyAutoLens",))
+    curve = Curve(KNOB, 1e-3, points, (Refusal("d", "why"),))
+    return AccuracyReport(system, "scene", (curve,), ("PyAutoLens",), (Refusal("draws", "no fit"),))
 
 
 def test_a_report_comes_back_from_json() -> None:
@@ -113,6 +114,7 @@ def test_a_page_of_several_systems_says_where_the_default_is_beaten_and_why() ->
     assert "| **a** | 1 | 1 | 1 | 0 of 2 |" in page
     assert "| b | 0.5 | 0.5 | 0.5 | 2 of 2 |" in page
     assert "off the front in S1, S2. Because." in page
+    assert "Not measured in S2: draws: no fit." in page
     assert "PyAutoLens is not installed here." in accuracy_markdown(some_report("S1"))
 
 
