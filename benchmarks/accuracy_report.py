@@ -143,6 +143,8 @@ def heading(reports: dict[str, AccuracyReport], engines: dict[str, str]) -> str:
     """What stands above the tables."""
     absent = sorted({peer for report in reports.values() for peer in report.absent})
     missing = "".join(f" {peer} was not installed." for peer in absent)
+    left = [system for system in system_names() if system not in reports]
+    missing += f" Not measured yet: {', '.join(left)}." if left else ""
     made = ", ".join(f"`{digest}`" for digest in dict.fromkeys(engines.values()))
     return f"""# Speed against error
 

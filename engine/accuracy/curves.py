@@ -8,8 +8,10 @@ from typing import Any
 
 from engine.errors import AccuracyError
 
-COST_MARGIN = 0.1
+MARGIN = 0.1
 """Part of a cost, or of an error, by which points have to differ to be told apart: times repeat to a few per cent."""
+SCATTER = 0.5
+"""The same of the error of a chain, or of some draws, which is itself drawn by lot."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class Knob:
 
     ``place`` is where it is set, ``quantity`` and ``unit`` what its error is of, ``work`` what is timed, ``reference``
     what the error is against. ``why_off_front`` says why the default is kept where another setting is better; it is
-    empty where none is in any system.
+    empty where none is in any system. ``resolution`` is the part of an error by which settings have to differ to be
+    told apart.
     """
 
     stage: str
@@ -48,6 +51,7 @@ class Knob:
     work: str
     reference: str
     why_off_front: str = ""
+    resolution: float = MARGIN
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ class Curve:
 
     def front(self) -> tuple[Point, ...]:
         """Our own points that no other one of ours beats, by rising cost."""
-        return pareto_front([point for point in self.points if point.peer is None], self.floor)
+        return pareto_front([point for point in self.points if point.peer is None], self.floor, self.knob.resolution)
 
     @property
     def default_on_front(self) -> bool:
@@ -84,18 +88,18 @@ class Curve:
         return self.default in self.front()
 
 
-def beats(one: Point, other: Point, floor: float) -> bool:
-    """Whether one point is no worse in cost and error, and better by :data:`COST_MARGIN` in one of them."""
+def beats(one: Point, other: Point, floor: float, resolution: float = MARGIN) -> bool:
+    """Whether one point is no worse in cost and error, and better in one of them by what can be told apart."""
     error, against = max(one.error, floor), max(other.error, floor)
     no_worse = one.cost <= other.cost and error <= against
-    better = one.cost < (1.0 - COST_MARGIN) * other.cost or error < (1.0 - COST_MARGIN) * against
+    better = one.cost < (1.0 - MARGIN) * other.cost or error < (1.0 - resolution) * against
     return no_worse and better
 
 
-def pareto_front(points: Iterable[Point], floor: float = 0.0) -> tuple[Point, ...]:
+def pareto_front(points: Iterable[Point], floor: float = 0.0, resolution: float = MARGIN) -> tuple[Point, ...]:
     """The points that no other beats, by rising cost."""
     all_points = list(points)
-    front = [one for one in all_points if not any(beats(other, one, floor) for other in all_points)]
+    front = [one for one in all_points if not any(beats(other, one, floor, resolution) for other in all_points)]
     return tuple(sorted(front, key=lambda point: (point.cost, point.error)))
 
 

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from engine.accuracy.curves import Curve, Knob
+from engine.accuracy.curves import SCATTER, Curve, Knob
 from engine.accuracy.subject import Subject
 from engine.accuracy.timing import Measuring
 from engine.conventions import rate_to_magnitude
@@ -23,6 +23,7 @@ DRAWS = Knob(
     unit="mag",
     work="sources drawn and refitted",
     reference="the draws that are not in the set, of states that no chain has made",
+    resolution=SCATTER,
 )
 _DRAWN = 150
 _SETTINGS = (5, 10, 15, 50)

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from engine.accuracy.curves import Curve, Knob
+from engine.accuracy.curves import SCATTER, Curve, Knob
 from engine.accuracy.importance import WeightedPosterior
 from engine.accuracy.subject import Subject
 from engine.accuracy.timing import Measuring
@@ -27,7 +27,7 @@ _SAME = f"surrogate learnt, and {_STATES} states"
 
 
 def _knob(name: str, place: str, work: str, why_off_front: str = "") -> Knob:
-    return Knob(STAGE, name, place, _QUANTITY, _UNIT, work, _REFERENCE, why_off_front)
+    return Knob(STAGE, name, place, _QUANTITY, _UNIT, work, _REFERENCE, why_off_front, SCATTER)
 
 
 LESSONS = _knob("surrogate lessons", "engine.posterior.surrogate.Schooling.good", _SAME)

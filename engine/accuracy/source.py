@@ -41,7 +41,12 @@ GRID = _knob("source grid", "Analysis.source_pixels")
 SUBRAYS = _knob("sub-rays", "Analysis.subrays")
 MARGIN = _knob("ray margin", "Analysis.ray_margin")
 PSF_RADIUS = _knob("PSF radius of the inversion", "Analysis.psf_radius")
-REGULARISATION = _knob("regularisation", "Analysis.regularisation, Analysis.source_envelope")
+REGULARISATION = _knob(
+    "regularisation",
+    "Analysis.regularisation, Analysis.source_envelope",
+    "What leaves less of the image holds the source less: without the clump ln Z of `gradient` is 87 and 40 lower, "
+    "that of `zeroth` 325 and 174 (HE0435, SDSS0246), and two to five times as many parameters are left to the data.",
+)
 
 
 def with_data(likelihood: MarginalLikelihood, data: FloatArray) -> MarginalLikelihood:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from engine.accuracy.curves import AccuracyReport, Curve, by_knob
 from engine.errors import NothingToShowError
@@ -16,6 +17,9 @@ from engine.figures.style import INK, MARKERS, OKABE_ITO, legend, new_figure, pl
 _WIDTH, _HEIGHT, _COLUMNS = 3.1, 2.7, 4
 _LABELLED = 16
 """Characters of a setting that stand beside its point where one system alone is shown."""
+_FEW_DECADES = 1.6
+_ROOM = (0.4, 0.06)
+"""Width and height of a label as parts of a panel."""
 _PEER_MARKS = {"lenstronomy": "P", "PyAutoLens": "X"}
 
 
@@ -74,14 +78,32 @@ def _panel(axes: Axes, curves: Sequence[tuple[int, Curve]], *, alone: bool) -> N
                     x, y, marker=_PEER_MARKS.get(point.peer, "X"), color=colour, markersize=6, linestyle="none",
                     markeredgecolor=INK, markeredgewidth=0.5,
                 )  # fmt: skip
-            if alone:
-                axes.annotate(
-                    plain(point.setting[:_LABELLED]), (x, y), xytext=(4, 4), textcoords="offset points", fontsize=6
-                )
     axes.margins(0.15)
     _whole_decade(axes)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        few = math.log10(high / low) < _FEW_DECADES
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=6))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    axes.tick_params(labelsize=7)
+    if alone:
+        _label(axes, curves[0][1])
     axes.set_xlabel("CPU, of the default's", fontsize=8)
     axes.set_ylabel(f"error [{curves[0][1].knob.unit}]", fontsize=8)
+
+
+def _label(axes: Axes, curve: Curve) -> None:
+    """Settings beside the points of default, front and peers, where there is room."""
+    shown = [point for point in curve.points if point.default or point.peer is not None or point in curve.front()]
+    taken: list[tuple[float, float]] = []
+    for point in sorted(shown, key=lambda found: not found.default):
+        at = (curve.ratio(point), _shown(point.error, curve.floor))
+        x, y = axes.transAxes.inverted().transform(axes.transData.transform(at))
+        if any(abs(x - left) < _ROOM[0] and abs(y - low) < _ROOM[1] for left, low in taken):
+            continue
+        taken.append((x, y))
+        axes.annotate(plain(point.setting[:_LABELLED]), at, xytext=(5, 5), textcoords="offset points", fontsize=6)
 
 
 def _whole_decade(axes: Axes) -> None:
