@@ -30,6 +30,8 @@ PLACEMENT = Knob(
     unit=_UNIT,
     work="the lensed host on the sub-pixels, and its cusps placed",
     reference=_REFERENCE,
+    why_off_front="On sub-pixels of 0.01 arcsec (UVIS, ACS) hosts are smooth and the cusps could stay where they "
+    "are; in F160W that would be 0.13 of the noise, and a part of a rendering is all that it costs.",
 )
 OVERSAMPLING = Knob(
     stage=STAGE,

@@ -243,3 +243,44 @@ def test_the_page_is_made_of_the_data() -> None:
         for curve in report.curves:
             assert curve.knob == described[curve.knob.stage, curve.knob.name], AGAIN
     assert COMMITTED.with_suffix(".md").read_text().endswith(accuracy_page(committed())), AGAIN
+
+
+def error_of(curve: Curve, setting: str, peer: str | None = None) -> float:
+    return next(found.error for found in curve.points if (found.setting, found.peer) == (setting, peer))
+
+
+def measured(name: str) -> dict[str, Curve]:
+    return {report.system: curve for report in committed() for curve in report.curves if curve.knob.name == name}
+
+
+def test_rendering_and_psf_are_as_the_documentation_says() -> None:
+    """docs/explanation/accuracy.md, speed against error."""
+    for curve in measured("pixel integration").values():
+        assert curve.default.error < 1e-3
+        theirs = [found for found in curve.points if found.peer and found.setting == "4 x 4"]
+        assert theirs
+        for found in theirs:
+            assert found.error > 200 * curve.default.error
+            assert curve.ratio(found) > 5
+    waves = {system: curve.default.error for system, curve in measured("PSF wavelengths").items()}
+    assert waves["HE0435"] == pytest.approx(0.05, abs=0.01)
+    assert 0.4 < max(waves.values()) < 0.6
+    assert max(curve.default.error for curve in measured("PSF pupil grid").values()) < 0.1
+    assert max(curve.default.error for curve in measured("PSF stamp").values()) < 0.01
+
+
+def test_inversion_and_chain_are_as_the_documentation_says() -> None:
+    for curve in measured("noise covariance band").values():
+        assert error_of(curve, "diagonal") > 0.25
+        assert curve.default.error < 1e-9
+    for curve in measured("source grid").values():
+        assert curve.default.error < 1.01 * error_of(curve, "30 x 30")
+    (clumpy,) = [curve for system, curve in measured("source grid").items() if system == "HE0435"]
+    assert clumpy.default.error < 0.5 * error_of(clumpy, "15 x 15")
+    for curve in measured("ray margin").values():
+        assert error_of(curve, "2") < 1.015 * curve.default.error
+    for curve in measured("chain length").values():
+        assert curve.default.error < 0.06
+        assert error_of(curve, "30 tau") < 0.08
+    for curve in measured("draws").values():
+        assert curve.default.error < 0.02
