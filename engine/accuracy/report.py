@@ -126,10 +126,11 @@ def accuracy_page(reports: Sequence[AccuracyReport]) -> str:
         lines += [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
         lines += [f"| {' | '.join(row)} |" for row in _across(curves)]
         floors = [curve.floor for curve in curves if curve.floor]
-        lines += ["", f"The reference is good to {median(floors):.1g} (median)."] if floors else [""]
+        notes = [f"The reference is good to {median(floors):.1g} (median)."] if floors else []
         off = [system for system, curve in found if not curve.default_on_front]
         if off:
-            lines.append(f"The default is off the front in {', '.join(off)}. {knob.why_off_front}")
+            notes.append(f"The default is off the front in {', '.join(off)}. {knob.why_off_front}")
+        lines += ["", *notes] if notes else []
     return "\n".join([*lines, ""])
 
 
