@@ -81,6 +81,7 @@ bench: install-test
 tables: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation --write docs/tables/simulation.md
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence_growth
+	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.scenes --write docs/tables/scenes.md
 
 accuracy: install-test
 	$(BIN)/python -m benchmarks.peers || echo "peers could not be installed: they are left out"

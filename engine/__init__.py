@@ -66,6 +66,7 @@ from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 from engine.stages import ACCURACY_STAGES, STAGES
 from engine.user_files import read_camera, read_mapping, read_system
+from engine.work import Work
 
 if TYPE_CHECKING:
     from engine.acceptance import check_realization
@@ -217,6 +218,7 @@ __all__ = [
     "Trend",
     "TrendBin",
     "TrendSeries",
+    "Work",
     "accuracy_markdown",
     "accuracy_page",
     "accuracy_rows",

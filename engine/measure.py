@@ -28,6 +28,7 @@ from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_f
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
+from engine.work import Work, counted
 
 MeasurementStatus = Literal["ok", "poor_fit"]
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
@@ -69,7 +70,7 @@ class ImageMeasurement:
     units of the map: a drizzled image has less noise in a pixel than its map says where the map allows for what
     neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is ``poor_fit`` where chi2_per_dof
     exceeds :data:`POOR_FIT`. ``inversion`` is None where none was asked for, or where it failed, which ``warnings``
-    then say.
+    then say. ``work`` counts all that was computed, that of an inversion that failed included.
     """
 
     host: Estimate
@@ -93,6 +94,7 @@ class ImageMeasurement:
     observation: Observation
     fit: ParametricFit
     inversion: SampledInversion | None
+    work: Work
 
     @property
     def estimator(self) -> str:
@@ -132,6 +134,7 @@ class ImageMeasurement:
             "chain": None if chain is None else asdict(chain),
             "inversion_chi2_per_dof": self.inversion_chi2_per_dof,
             "stamp_error": fit.stamp_error,
+            "model_error": _error_document(self),
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,
             "deflector": None if fit.deflector is None else asdict(fit.deflector),
@@ -139,6 +142,7 @@ class ImageMeasurement:
             "profile": self.profile,
             "seed": self.seed,
             "seconds": self.seconds,
+            "work": asdict(self.work),
             "warnings": list(self.warnings),
             "versions": self.versions,
             "engine_digest": self.engine_digest,
@@ -161,6 +165,15 @@ def _document(value: Quantity) -> dict[str, Any]:
     return {"mean": value.mean, "sd": value.sd, "interval95": list(value.interval95)}
 
 
+def _error_document(found: ImageMeasurement) -> dict[str, Any] | None:
+    """What the model is wrong by, as far as the image shows it; the host with a model that is taken for exact."""
+    error = found.fit.error
+    if error is None:
+        return None
+    exact = rate_to_magnitude(error.flux_without, found.observation.zero_point) if error.flux_without > 0 else None
+    return {"psf": error.psf, "host": error.host, "ln_evidence": error.gain, "magnitude_if_exact": exact}
+
+
 def _host_document(found: Estimate) -> dict[str, Any]:
     values = {
         "magnitude": found.magnitude,
@@ -178,6 +191,18 @@ def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, sc
     used = np.isfinite(fit.sigma)
     variance = fit.sigma[used] ** 2 + (scale**2 - 1.0) * observation.noise[used] ** 2
     return float(np.sum(residual[used] ** 2 / variance))
+
+
+def _of_model(fit: ParametricFit) -> list[str]:
+    """What is said of a model that is not exact."""
+    if fit.error is None:
+        return []
+    told = []
+    if fit.error.psf > 0:
+        told.append(f"psf: by the AGN images the stamp is wrong by {fit.error.psf:.0%} of its light; corrected by them")
+    if fit.error.host > 0:
+        told.append(f"host: departs from its Sersic profile by {fit.error.host:.0%} of its light")
+    return [f"{one}; the errors hold what that leaves open" for one in told]
 
 
 def _by_name(parameters: Sequence[LensParameter]) -> dict[str, Quantity]:
@@ -238,16 +263,17 @@ def measure_image(
     warnings = [*observation.notes, *unlikely(observation, trusting=trust_options)]
     warnings += require_lens(observation, trusting=trust_options)
     rng = np.random.default_rng(seed)
-    found = analyse(
-        observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
-        shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
-    )  # fmt: skip
-    fit, orientation = found.fit, observation.orientation
-    if inversion:
-        try:
-            found = analyse(observation, analysis, rng, fit=fit, progress=progress)
-        except (PosteriorError, InversionError, ObservationError) as error:
-            warnings.append(f"inversion: {error}")
+    with counted() as tally:
+        found = analyse(
+            observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
+            shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
+        )  # fmt: skip
+        fit, orientation = found.fit, observation.orientation
+        if inversion:
+            try:
+                found = analyse(observation, analysis, rng, fit=fit, progress=progress)
+            except (PosteriorError, InversionError, ObservationError) as error:
+                warnings.append(f"inversion: {error}")
     residual = observation.image - fit.model
     measured = noise_scale(observation, residual, fit.sigma, fit.lens)
     if measured is None:
@@ -263,6 +289,7 @@ def measure_image(
     warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
         warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
+    warnings += _of_model(fit)
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     status: MeasurementStatus = "ok"
     if chi2 > POOR_FIT:
@@ -294,4 +321,5 @@ def measure_image(
         observation=observation,
         fit=fit,
         inversion=found.inversion,
+        work=tally.work(),
     )

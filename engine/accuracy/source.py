@@ -38,7 +38,11 @@ def _knob(name: str, place: str, why_off_front: str = "") -> Knob:
 
 
 GRID = _knob("source grid", "Analysis.source_pixels")
-SUBRAYS = _knob("sub-rays", "Analysis.subrays")
+SUBRAYS = _knob(
+    "sub-rays",
+    "Analysis.subrays",
+    "Where the nodes cannot hold the clump the rays do not matter; where they can (HE0435) one ray leaves 6 % more.",
+)
 MARGIN = _knob(
     "ray margin",
     "Analysis.ray_margin",

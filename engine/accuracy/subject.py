@@ -14,9 +14,9 @@ from engine.accuracy.importance import WeightedPosterior, importance_sample
 from engine.conventions import FloatArray
 from engine.experiment import analysis_of
 from engine.grid import Grid, expand
+from engine.imaging.cusps import cusp_positions
 from engine.imaging.drizzling import drizzle
 from engine.imaging.geometry import Geometry, exposure_geometry
-from engine.lensing.lens_equation import solve_lens_equation
 from engine.likelihood.problem import Problem, prepare_problem, ring_mask
 from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum
@@ -85,8 +85,7 @@ class Subject:
     @cached_property
     def cusps(self) -> list[tuple[float, float]]:
         """Image positions [arcsec] of the host's centre."""
-        host = self.scene.host
-        return [(image.x, image.y) for image in solve_lens_equation(self.scene.lens, host.x, host.y)]
+        return cusp_positions(self.scene.host, self.scene.lens, self.geometry)
 
     @property
     def reach(self) -> float:

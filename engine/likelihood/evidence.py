@@ -17,6 +17,7 @@ from engine.likelihood.w_tilde import curvature_matrices, curvature_matrix, toge
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, map_rays
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant
+from engine.work import count
 
 MAX_CONDITION = 1e14
 """Beyond this the solution has lost all but two digits."""
@@ -97,6 +98,7 @@ def _solve(
 ) -> _Solved:
     """Factorise A = F + lambda H and solve; ``f`` (Fortran order, valid in its lower triangle) is overwritten."""
     d = lensing.transpose(likelihood.wd)
+    count("columns_solved", d.size)
     add_regularisation(f, model, _strength(ln_lambda))
     factor, info = lapack.dpotrf(f, lower=1, clean=0, overwrite_a=1)
     if info != 0:
@@ -147,6 +149,7 @@ def ln_evidences(
 
     As many as fit the cache share what it costs to fetch W from memory (:func:`~.w_tilde.together`).
     """
+    count("evidence_evaluations", len(lenses))
     n = model.shape[0] * model.shape[1]
     found: list[float | InversionError] = []
     size = together(n)

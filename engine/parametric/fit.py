@@ -25,6 +25,7 @@ from engine.parametric.parameters import BACKGROUND, HOST_FLUX
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
+from engine.parametric.shared_error import ModelError
 from engine.parametric.solution import Solution
 from engine.parametric.uncertainty import host_posteriors, parameter_covariance
 from engine.result import IndexPrior
@@ -45,7 +46,8 @@ class ParametricFit:
     (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
     times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
     with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
-    of the lensed host [e-/s].
+    of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how much,
+    or is None, and ``psf`` (n, n) is the stamp with its correction.
     """
 
     lens: PowerLawLens
@@ -63,6 +65,8 @@ class ParametricFit:
     model: FloatArray
     arc: FloatArray
     sigma: FloatArray
+    psf: FloatArray
+    error: ModelError | None
 
     @property
     def misfit(self) -> float:
@@ -132,8 +136,8 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     """A solution as it is handed on; a PosteriorError where it is no good."""
     model, values, space = solution.model, solution.values, solution.space
     jacobian, amplitudes = model.full_jacobian(values)
-    _, rest, _ = model.amplitudes(values)
-    chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes
+    host_departs, unmodelled, rest = model.explained(values)
+    chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes - round(model.shared_parameters)
     flux = float(amplitudes[HOST_FLUX])
     if not flux > 0:
         raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
@@ -150,8 +154,8 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     inflation = max(1.0, chi2 / freedom)
     covariance = inflation * parameter_covariance(model, jacobian)
     hosts = host_posteriors(solution, covariance, inflation, fixed_index)
-    shape = task.observation.shape
-    shown = ImageModel(task.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True)
+    shape = model.observation.shape
+    shown = ImageModel(model.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True)
     columns = shown.columns(values)
     deflector = profile_of(values[space.deflector_slice], float(amplitudes[space.n_agn])) if space.deflector else None
     return ParametricFit(
@@ -167,7 +171,9 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         degrees_of_freedom=freedom,
         stamp_error=solution.stamp_error,
         at_bound=solution.at_bound,
-        model=(columns @ amplitudes).reshape(shape),
-        arc=(columns[:, HOST_FLUX] * flux).reshape(shape),
+        model=(columns @ amplitudes).reshape(shape) + unmodelled,
+        arc=(columns[:, HOST_FLUX] * flux).reshape(shape) + host_departs,
         sigma=model.sigma,
+        psf=model.observation.psf,
+        error=solution.error,
     )

@@ -203,4 +203,9 @@ def _summary(found: ImageMeasurement) -> list[str]:
     lines = [f"host.{name:10s} {value.mean:8.3f} +- {value.sd:.3f}" for name, value in values]
     lines += [f"lens.{name:10s} {value.mean:8.3f} +- {value.sd:.3f}" for name, value in lens.items()]
     lines.append(f"{len(found.agn)} AGN images, chi2/dof {found.chi2_per_dof:.2f}, {found.estimator}, {found.status}")
-    return lines
+    work = found.work
+    told = f"{work.pixels_rendered:,} pixels rendered, {work.rays_traced:,} rays traced, "
+    told += f"{work.columns_solved:,} columns solved"
+    if work.parameters_sampled:
+        told += f", {work.parameters_sampled} parameters sampled by {work.evidence_evaluations:,} evidence evaluations"
+    return [*lines, told]
