@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 from engine.acceptance import check_realization
+from engine.catalogue import resolve_system
 from engine.comparison import compare, view_beside
 from engine.inspection import InversionView, inspect_inversion
 from engine.reconstruction import analyse
 from engine.result import RunResult
-from engine.simulation.scene import resolve_system
 from engine.simulation.seeds import generator
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import Analysis

@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 from engine.accuracy.curves import Curve, Knob
 from engine.accuracy.subject import Subject
 from engine.accuracy.timing import Measuring, least_cpu
+from engine.catalogue.__init__ import resolve_dither
 from engine.errors import ObservationError
 from engine.imaging.convolution import point_source_image
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
@@ -21,7 +22,6 @@ from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import exposure_noise
 from engine.imaging.psf import detector_kernel, telescope_psf
-from engine.simulation.scene import resolve_dither
 from engine.simulation.simulate import blurred_host, high_resolution_host, high_resolution_image
 
 STAGE = "drizzle"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from engine.acceptance import check_realization
 from engine.accuracy.importance import WeightedPosterior, importance_sample
+from engine.catalogue.__init__ import resolve_dither
 from engine.conventions import FloatArray
 from engine.experiment import analysis_of
 from engine.grid import Grid, expand
@@ -21,7 +22,7 @@ from engine.likelihood.problem import Problem, prepare_problem, ring_mask
 from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.posterior.optimum import find_optimum
 from engine.posterior.start import find_start, prepare_target
-from engine.simulation.scene import Scene, build_scene, resolve_dither
+from engine.simulation.scene import Scene, build_scene
 from engine.simulation.simulate import Simulation, scene_geometry, simulate_realization
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization

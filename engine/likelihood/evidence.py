@@ -13,7 +13,7 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
-from engine.likelihood.w_tilde import curvature_matrices, curvature_matrix, together, workspace
+from engine.likelihood.curvature import curvature_matrices, curvature_matrix, together, workspace
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, map_rays
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant
@@ -147,7 +147,7 @@ def ln_evidences(
 ) -> list[float | InversionError]:
     """Ln Z of the data given each lens and its ln lambda; where it cannot be had the error that says why.
 
-    As many as fit the cache share what it costs to fetch W from memory (:func:`~.w_tilde.together`).
+    As many as fit the cache share what it costs to fetch W from memory (:func:`~.curvature.together`).
     """
     count("evidence_evaluations", len(lenses))
     n = model.shape[0] * model.shape[1]

@@ -13,6 +13,7 @@ from functools import lru_cache
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from engine.catalogue import resolve_dither
 from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.imaging.convolution import convolve, point_source_image
@@ -26,7 +27,7 @@ from engine.imaging.observation import Observation, Provenance
 from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.light.rendering import render_sersic
-from engine.simulation.scene import Scene, build_scene, resolve_dither
+from engine.simulation.scene import Scene, build_scene
 from engine.simulation.seeds import sky_generator
 from engine.spec.instrument import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
 from engine.spec.realization import Realization
