@@ -14,7 +14,7 @@ from scipy.sparse.linalg import splu
 from engine.accuracy.curves import Curve, Knob
 from engine.accuracy.subject import Subject
 from engine.accuracy.timing import Measuring, least_cpu
-from engine.catalogue.__init__ import resolve_dither
+from engine.catalogue import resolve_dither
 from engine.errors import ObservationError
 from engine.imaging.convolution import point_source_image
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engine.acceptance import check_realization
 from engine.accuracy.importance import WeightedPosterior, importance_sample
-from engine.catalogue.__init__ import resolve_dither
+from engine.catalogue import resolve_dither
 from engine.conventions import FloatArray
 from engine.experiment import analysis_of
 from engine.grid import Grid, expand
