@@ -4,33 +4,25 @@ The scene is HE0435's lens, 100 x 100 pixels of 0.08 arcsec. Errors are those of
 brightest; all on one core. lenstronomy runs here, PyAutoLens in an environment of its own (see benchmarks.peers).
 """
 
-import dataclasses
-import json
-import os
-import subprocess
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
-from lenstronomy.Data.imaging_data import ImageData
-from lenstronomy.Data.psf import PSF
-from lenstronomy.ImSim.image_model import ImageModel
-from lenstronomy.LensModel.lens_model import LensModel
-from lenstronomy.LightModel.light_model import LightModel
-from lenstronomy.Util.param_util import phi_q2_ellipticity
 
 from benchmarks import peers
+from benchmarks.accuracy_report import autolens_images
 from benchmarks.timing import least
+from engine.accuracy.light_reference import flux_through_the_sides, graded_fluxes
+from engine.accuracy.peers import lenstronomy_image
+from engine.accuracy.rendering import uniform
+from engine.accuracy.timing import least_cpu
 from engine.conventions import pixel_centres
-from engine.lensing.power_law import PowerLawLens, deflection
-from engine.light.rendering import render_sersic, sample_sersic
-from engine.light.sersic import SersicProfile, sersic_k, sersic_normalisation
+from engine.lensing.power_law import PowerLawLens
+from engine.light.rendering import render_sersic
+from engine.light.sersic import SersicProfile
 from engine.simulation.scene import build_scene
 from engine.simulation.simulate import scene_geometry, simulate
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
-from tests.engine.light_oracle import flux_through_the_sides, graded_fluxes
 
 LENS = PowerLawLens(1.2171, 0.85, 1.29, 2.0)
 PIXELS, SCALE = 100, 0.08
@@ -45,16 +37,6 @@ def host(n: float, r_eff: float) -> SersicProfile:
 
 def render(profile: SersicProfile, tolerance: float = 1e-4) -> np.ndarray:
     return render_sersic(profile, AXIS, AXIS, SCALE, LENS, tolerance)
-
-
-def uniform(profile: SersicProfile, subpixels: int) -> np.ndarray:
-    """Uniform supersampling with our own ray tracer and radial table, some rows at a time."""
-    offsets = ((np.arange(subpixels) + 0.5) / subpixels - 0.5) * SCALE
-    columns, image = np.add.outer(AXIS, offsets).ravel(), []
-    for part in np.array_split(AXIS, max(1, subpixels // 4)):
-        rays = sample_sersic(profile, LENS, columns, np.add.outer(part, offsets).ravel(), SCALE / subpixels)
-        image.append(rays.reshape(part.size, subpixels, AXIS.size, subpixels).sum(axis=(1, 3)))
-    return np.vstack(image)
 
 
 def errors(image: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
@@ -78,136 +60,29 @@ def tolerances() -> None:
             print(f"    {tolerance:7.0e} {pixel:9.1e} {flux:9.1e} {seconds * 1e3:8.1f}")
 
 
-def supersampling() -> None:
-    """Uniform supersampling that reaches what is wanted, with the same ray tracer, against ours at the same error."""
-    print(f"uniform supersampling to {WANTED_PIXEL:.0e} of the peak and {WANTED_FLUX:.0e} of the flux")
-    for n, r_eff in ((1.0, 0.39), (4.0, 0.39), (4.0, 0.05)):
-        profile = host(n, r_eff)
-        reference = render(profile, 1e-7)
-        # The cheapest of both that keeps both promises.
-        tolerance = next(
-            t
-            for t in (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
-            if all(
-                e < w for e, w in zip(errors(render(profile, t), reference), (WANTED_PIXEL, WANTED_FLUX), strict=True)
-            )
-        )
-        ours = least(lambda t=tolerance, p=profile: render(p, t), 25)
-        default = least(lambda p=profile: render(p), 25)
-        for subpixels in (2, 4, 8, 16, 32, 64):
-            pixel, flux = errors(uniform(profile, subpixels), reference)
-            if pixel < WANTED_PIXEL and flux < WANTED_FLUX:
-                break
-        theirs = least(lambda s=subpixels, p=profile: uniform(p, s), 1)
-        reached = "reached" if pixel < WANTED_PIXEL and flux < WANTED_FLUX else "not reached"
-        print(
-            f"  n = {n:.0f}, r_eff = {r_eff}: {subpixels} x {subpixels} rays {theirs * 1e3:7.1f} ms ({pixel:.1e}, "
-            f"{flux:.1e}: {reached}); ours {ours * 1e3:5.1f} ms at tolerance {tolerance:.0e}, "
-            f"{default * 1e3:5.1f} ms at 1e-04; ratio {theirs / ours:5.1f}, {theirs / default:5.1f}"
-        )
-
-
-def lenstronomy_image(profile: SersicProfile) -> tuple[ImageModel, list[dict], list[dict]]:
-    data = ImageData(
-        image_data=np.zeros((PIXELS, PIXELS)),
-        ra_at_xy_0=AXIS[0],
-        dec_at_xy_0=AXIS[0],
-        transform_pix2angle=np.eye(2) * SCALE,
-    )
-    e1, e2 = phi_q2_ellipticity(LENS.phi, LENS.q)
-    lens = [{"theta_E": LENS.theta_E, "gamma": LENS.slope, "e1": e1, "e2": e2, "center_x": 0.0, "center_y": 0.0}]
-    e1, e2 = phi_q2_ellipticity(profile.phi, profile.q)
-    light = [
-        {
-            "amp": profile.flux * effective_brightness(profile),
-            "R_sersic": profile.r_eff,
-            "n_sersic": profile.n,
-            "e1": e1,
-            "e2": e2,
-            "center_x": profile.x,
-            "center_y": profile.y,
-        }
-    ]
-    model = ImageModel(
-        data,
-        PSF(psf_type="NONE"),
-        LensModel(["EPL_NUMBA"]),
-        LightModel(["SERSIC_ELLIPSE"]),
-        kwargs_numerics={"supersampling_factor": PEER_SUBPIXELS, "supersampling_convolution": False},
-    )
-    return model, lens, light
-
-
-def effective_brightness(profile: SersicProfile) -> float:
-    """Surface brightness at the half-light radius, for unit flux."""
-    return sersic_normalisation(profile.n, profile.r_eff) * float(np.exp(-sersic_k(profile.n)))
-
-
 def against_peers() -> None:
+    """Same rays, same pixels; then time and error of each. In units of the noise: ``benchmarks.accuracy_report``."""
     profile = host(4.0, 0.39)
     reference = render(profile, 1e-7)
     pixel, flux = errors(render(profile), reference)
-    seconds = least(lambda: render(profile), 40)
-    print(f"n = 4, r_eff = 0.39, {PIXELS} x {PIXELS} pixels of {SCALE} arcsec: pixel error, flux error, ms")
+    seconds = least_cpu(lambda: render(profile))
+    print(f"n = 4, r_eff = 0.39, {PIXELS} x {PIXELS} pixels of {SCALE} arcsec: pixel error, flux error, CPU ms")
     print(f"  {'hostlens':24s} {pixel:9.1e} {flux:9.1e} {seconds * 1e3:8.1f}")
-
-    model, lens, light = lenstronomy_image(profile)
-
-    def peer() -> np.ndarray:
-        return np.asarray(model.source_surface_brightness(light, lens, unconvolved=True))
-
-    image = peer()
-    # The same scene: the same supersampling with our ray tracer gives the same pixels.
-    same = float(np.abs(image - uniform(profile, PEER_SUBPIXELS)).max() / reference.max())
-    assert same < 1e-3, same
-    report_peer("lenstronomy", image, reference, least(peer, 9), (pixel, seconds))
-    autolens(profile, reference, (pixel, seconds))
-
-
-def report_peer(name: str, image: np.ndarray, reference: np.ndarray, seconds: float, ours: tuple[float, float]) -> None:
-    pixel, flux = errors(image, reference)
-    ratio, better = seconds / ours[1], pixel / ours[0]
-    print(
-        f"  {name + f' {PEER_SUBPIXELS} x {PEER_SUBPIXELS}':24s} {pixel:9.1e} {flux:9.1e} {seconds * 1e3:8.1f}"
-        f"   {ratio:.0f} times our time, {better:.0f} times our error"
-    )
-
-
-def autolens(profile: SersicProfile, reference: np.ndarray, ours: tuple[float, float]) -> None:
-    python = peers.interpreter("autolens")
-    if python is None:
+    theirs = lenstronomy_image(profile, LENS, AXIS, AXIS, SCALE, PEER_SUBPIXELS)
+    found = {"lenstronomy": (theirs(), least_cpu(theirs))}
+    if peers.interpreter("autolens") is None:
         print(f"  {peers.missing('autolens')}")
-        return
-    probe = (1.0, 0.3)
-    bent = deflection(LENS, np.array([probe[0]]), np.array([probe[1]]))
-    with tempfile.TemporaryDirectory() as folder:
-        scene = {
-            "lens_q": LENS.q,
-            "lens_phi": LENS.phi,
-            "probe": probe,
-            "deflection": [float(component[0]) for component in bent],
-            **dataclasses.asdict(profile),
-            "intensity": profile.flux * effective_brightness(profile),
-            "subpixels": [PEER_SUBPIXELS],
-            "pixels": PIXELS,
-            "scale": SCALE,
-            "folder": folder,
-        }
-        script = Path(peers.__file__).with_name("autolens_rendering.py")
-        environment = {**os.environ, "PYAUTO_SKIP_WORKSPACE_VERSION_CHECK": "1"}
-        done = subprocess.run(
-            [str(python), str(script), json.dumps(scene)],
-            capture_output=True,
-            text=True,
-            check=True,
-            cwd=folder,
-            env=environment,
+    else:
+        found["PyAutoLens"] = autolens_images(profile, LENS, PIXELS, SCALE, (PEER_SUBPIXELS,))[0]
+    same = uniform(profile, LENS, AXIS, AXIS, SCALE, PEER_SUBPIXELS)
+    for name, (image, took) in found.items():
+        # The same scene: the same supersampling with our ray tracer gives the same pixels.
+        assert float(np.abs(image - same).max() / reference.max()) < 1e-3, name
+        pixel_error, flux_error = errors(image, reference)
+        print(
+            f"  {name + f' {PEER_SUBPIXELS} x {PEER_SUBPIXELS}':24s} {pixel_error:9.1e} {flux_error:9.1e} "
+            f"{took * 1e3:8.1f}   {took / seconds:.0f} times our time, {pixel_error / pixel:.0f} times our error"
         )
-        run = json.loads(done.stdout.splitlines()[-1])["runs"][0]
-        image = np.load(run["image"])
-    same = float(np.abs(image - uniform(profile, PEER_SUBPIXELS)).max() / reference.max())
-    assert same < 1e-3, same
-    report_peer("PyAutoLens", image, reference, run["seconds"], ours)
 
 
 def simulations() -> None:
@@ -244,7 +119,6 @@ def main() -> None:
     began = time.perf_counter()
     against_peers()
     tolerances()
-    supersampling()
     simulations()
     print(f"all in {time.perf_counter() - began:.0f} s")
 

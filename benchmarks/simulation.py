@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.psf_figures import effective_psf, encircled_energy, full_width_half_maximum
 from benchmarks.timing import least
+from engine.accuracy.light_reference import flux_through_the_sides, graded_fluxes
 from engine.catalogue import camera_names, load_camera, load_dither, read_catalogue, system_names
 from engine.conventions import FloatArray
 from engine.imaging.convolution import convolve, point_source_image
@@ -38,7 +39,6 @@ from engine.simulation.simulate import optical_psf, scene_geometry, simulate
 from engine.spec.realization import Realization
 from engine.spec.sky import Host
 from tests.engine.angular_solver import AngularSolver
-from tests.engine.light_oracle import flux_through_the_sides, graded_fluxes
 
 NOISE_DRAWS = 100
 HARDEST_HOST = Host(n=4.0, r_eff=0.3, magnitude=20.5)

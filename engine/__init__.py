@@ -14,6 +14,7 @@ import engine.home  # noqa: F401 - before Astropy is imported
 from engine.catalogue import camera_names, load_camera, load_system, system_facts, system_names
 from engine.digest import engine_digest, engine_versions
 from engine.errors import (
+    AccuracyError,
     EngineError,
     FigureError,
     InversionError,
@@ -63,12 +64,15 @@ from engine.spec.realization import (
 )
 from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
-from engine.stages import STAGES
+from engine.stages import ACCURACY_STAGES, STAGES
 from engine.user_files import read_camera, read_mapping, read_system
 from engine.work import Work
 
 if TYPE_CHECKING:
     from engine.acceptance import check_realization
+    from engine.accuracy.curves import AccuracyReport, report_from_dict
+    from engine.accuracy.report import accuracy_markdown, accuracy_page, accuracy_rows, measure_accuracy
+    from engine.accuracy.subject import hardest_realization
     from engine.biases import (
         BIN_WIDTH,
         GROUPINGS,
@@ -110,6 +114,9 @@ if TYPE_CHECKING:
 else:
     _LATE = {
         "engine.acceptance": "check_realization",
+        "engine.accuracy.curves": "AccuracyReport report_from_dict",
+        "engine.accuracy.report": "accuracy_markdown accuracy_page accuracy_rows measure_accuracy",
+        "engine.accuracy.subject": "hardest_realization",
         "engine.biases": (
             "BIN_WIDTH GROUPINGS HOST_QUANTITIES TRENDS BiasPoint Configuration CoverageCurve Grouping "
             "HostQuantity PullSummary Spread Trend TrendBin TrendSeries bias_points configuration_of "
@@ -145,6 +152,7 @@ else:
 
 
 __all__ = [
+    "ACCURACY_STAGES",
     "BIN_WIDTH",
     "GROUPINGS",
     "HOST_QUANTITIES",
@@ -152,6 +160,8 @@ __all__ = [
     "PROFILES",
     "STAGES",
     "TRENDS",
+    "AccuracyError",
+    "AccuracyReport",
     "Analysis",
     "Aperture",
     "BiasPoint",
@@ -209,6 +219,9 @@ __all__ = [
     "TrendBin",
     "TrendSeries",
     "Work",
+    "accuracy_markdown",
+    "accuracy_page",
+    "accuracy_rows",
     "analyse",
     "bias_points",
     "camera_from_mapping",
@@ -226,11 +239,13 @@ __all__ = [
     "field_path",
     "generator",
     "group_points",
+    "hardest_realization",
     "inspect_inversion",
     "inspect_simulation",
     "load_camera",
     "load_system",
     "mean_bias",
+    "measure_accuracy",
     "measure_image",
     "observation_from_arrays",
     "path_steps",
@@ -244,6 +259,7 @@ __all__ = [
     "read_system",
     "readings",
     "realization_from_dict",
+    "report_from_dict",
     "run",
     "serial_numbers",
     "simulate_realization",

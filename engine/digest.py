@@ -11,8 +11,8 @@ from importlib.resources.abc import Traversable
 
 _NUMERIC_PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "emcee", "drizzle", "poppy", "astropy")
 _SUFFIXES = (".py", ".yaml")
-_FIGURES = "figures"
-"""Left out of the digest: what is drawn of a result does not change it."""
+_LEFT_OUT = ("figures", "accuracy")
+"""Of the digest: what is drawn of a result, or measured of the engine, does not change it."""
 
 
 @cache
@@ -32,7 +32,7 @@ def _walk(folder: Traversable, prefix: str = "") -> list[tuple[str, Traversable]
     for entry in folder.iterdir():
         name = f"{prefix}{entry.name}"
         if entry.is_dir():
-            if entry.name not in ("__pycache__", _FIGURES):
+            if entry.name not in ("__pycache__", *_LEFT_OUT):
                 found += _walk(entry, f"{name}/")
         elif name.endswith(_SUFFIXES):
             found.append((name, entry))
@@ -41,7 +41,10 @@ def _walk(folder: Traversable, prefix: str = "") -> list[tuple[str, Traversable]
 
 @cache
 def engine_digest() -> str:
-    """SHA-256 (hex) over the engine's source and data files, figures left out, and versions of its numeric packages."""
+    """SHA-256 (hex) over the engine's source and data files and the versions of its numeric packages.
+
+    Left out is what no result depends on: figures, and the report of speed against error.
+    """
     digest = hashlib.sha256()
     for name, entry in _walk(files("engine")):
         digest.update(name.encode() + b"\0" + entry.read_bytes() + b"\0")

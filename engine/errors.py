@@ -56,6 +56,10 @@ class PosteriorError(EngineError, ArithmeticError):
     """No starting point with a finite posterior was found, or the chain cannot be run from it."""
 
 
+class AccuracyError(EngineError):
+    """What is asked for, or was measured, makes no report of speed against error."""
+
+
 class FigureError(EngineError, ValueError):
     """A figure cannot be drawn from what it was given; the message says what it got and what is allowed."""
 

@@ -13,6 +13,8 @@ Progress = Callable[[str, float], None]
 """Called with a stage of :data:`STAGES` and the part of it that is done."""
 STAGES = ("simulate", "parametric", "prepare", "optimum", "chain", "draws", "refit", "errors")
 """In their order; where no estimator needs a chain the run ends with ``parametric``."""
+ACCURACY_STAGES = ("deflection", "rendering", "cusps", "psf", "drizzle", "noise", "source", "sampling", "draws")
+"""What the report of speed against error is divided into, in the order of a run."""
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """Figures of runs, inversions, simulations, and of what many runs say. Not numeric: numbers become pictures."""
 
+from engine.figures.accuracy import accuracy_figure
 from engine.figures.biases import bias_figure
 from engine.figures.calibration import coverage_figure, pull_figure
 from engine.figures.inversion import inversion_figure
@@ -19,6 +20,7 @@ __all__ = [
     "Limits",
     "Pictures",
     "Thumbnail",
+    "accuracy_figure",
     "bias_figure",
     "coverage_figure",
     "figure_bytes",

@@ -10,7 +10,8 @@ band-limited, its convolution with what results is that with the light itself.
 from __future__ import annotations
 
 import math
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 
@@ -21,14 +22,24 @@ from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
 
-_FINE = 5
-"""Cells along a sub-pixel."""
-_HALF = 12
-"""Radius round a cusp within which light is moved [sub-pixels]: beyond it the light is smooth on their scale."""
+
+@dataclass(frozen=True)
+class CuspGrid:
+    """How finely light is placed, and how far from a cusp; :mod:`engine.accuracy.cusps` measures what each gains.
+
+    ``fine`` cells along a sub-pixel; ``half`` is the radius within which light is moved [sub-pixels], beyond which it
+    is smooth on their scale; ``nodes``, an even number, are the sub-pixels along each axis among which a cell's light
+    is divided by Lagrange interpolation.
+    """
+
+    fine: int = 5
+    half: int = 12
+    nodes: int = 8
+
+
+_USUAL = CuspGrid()
 _ON_RING = 10
 """Distance of points on a ring [sub-pixels]: between two of them more than eight tenths of its light are moved."""
-_NODES = 8
-"""Sub-pixels along each axis among which a cell's light is divided: Lagrange interpolation of order 7."""
 
 
 def cusp_positions(profile: SersicProfile, lens: PowerLawLens | None, geometry: Geometry) -> list[tuple[float, float]]:
@@ -48,6 +59,7 @@ def place_cusps(
     positions: list[tuple[float, float]],
     geometry: Geometry,
     lens: PowerLawLens | None = None,
+    cells: CuspGrid = _USUAL,
 ) -> FloatArray:
     """Replace the light round the cusps of a rendered profile by light that convolves as if nothing were pixelised.
 
@@ -57,6 +69,8 @@ def place_cusps(
         geometry.high_resolution_shape, flux per sub-pixel of ``profile`` behind ``lens``.
     positions
         Where the cusps are in the image [arcsec].
+    cells
+        How finely, and how far.
 
     Returns
     -------
@@ -64,25 +78,26 @@ def place_cusps(
     single values round the cusps may be negative.
     """
     x, y = geometry.high_resolution_axes()
-    scale, reach = geometry.subpixel_scale, _NODES // 2
+    scale, reach, fine, half = geometry.subpixel_scale, cells.nodes // 2, cells.fine, cells.half
     placed = np.pad(image, reach)
-    offsets = ((np.arange(_FINE) + 0.5) / _FINE - 0.5) * scale
+    offsets = ((np.arange(fine) + 0.5) / fine - 0.5) * scale
+    shares = partial(_shares, fine=fine, count=cells.nodes)
     for index, (cusp_x, cusp_y) in enumerate(positions):
         column, row = round((cusp_x - x[0]) / scale), round((cusp_y - y[0]) / scale)
-        rows = slice(max(row - _HALF, 0), min(row + _HALF + 1, y.size))
-        columns = slice(max(column - _HALF, 0), min(column + _HALF + 1, x.size))
+        rows = slice(max(row - half, 0), min(row + half + 1, y.size))
+        columns = slice(max(column - half, 0), min(column + half + 1, x.size))
         if rows.start >= rows.stop or columns.start >= columns.stop:
             continue
         cells_x, cells_y = np.add.outer(x[columns], offsets).ravel(), np.add.outer(y[rows], offsets).ravel()
-        light = render_sersic(profile, cells_x, cells_y, scale / _FINE, lens)
+        light = render_sersic(profile, cells_x, cells_y, scale / fine, lens)
         # What the blocks before this one have moved already stays moved.
-        light *= _taper(np.hypot(cells_x - cusp_x, cells_y[:, None] - cusp_y) / (_HALF * scale))
+        light *= _taper(np.hypot(cells_x - cusp_x, cells_y[:, None] - cusp_y) / (half * scale))
         for other_x, other_y in positions[:index]:
-            light *= 1.0 - _taper(np.hypot(cells_x - other_x, cells_y[:, None] - other_y) / (_HALF * scale))
+            light *= 1.0 - _taper(np.hypot(cells_x - other_x, cells_y[:, None] - other_y) / (half * scale))
         ny, nx = rows.stop - rows.start, columns.stop - columns.start
-        placed[reach:-reach, reach:-reach][rows, columns] -= light.reshape(ny, _FINE, nx, _FINE).sum(axis=(1, 3))
+        placed[reach:-reach, reach:-reach][rows, columns] -= light.reshape(ny, fine, nx, fine).sum(axis=(1, 3))
         placed[rows.start : rows.stop + 2 * reach, columns.start : columns.stop + 2 * reach] += (
-            _shares(ny) @ light @ _shares(nx).T
+            shares(ny) @ light @ shares(nx).T
         )
     return placed[reach:-reach, reach:-reach]
 
@@ -97,19 +112,19 @@ def _taper(radius: FloatArray) -> FloatArray:
 
 
 @cache
-def _shares(subpixels: int) -> FloatArray:
+def _shares(subpixels: int, fine: int, count: int) -> FloatArray:
     """Share of each of ``subpixels`` + 2 reach sub-pixels in the light of each of their cells, along one axis.
 
     The Lagrange polynomials on the nearest nodes, averaged over a sub-pixel, because all light is integrated over
     sub-pixels; over a little less, because a cell's light fills the cell (the variances of the two add up).
     """
-    width = np.sqrt(1.0 - _FINE**-2.0)
-    reach = _NODES // 2
-    points, weights = np.polynomial.legendre.leggauss(_NODES // 2)
-    nodes = np.arange(_NODES)
-    shares = np.zeros((subpixels + 2 * reach, subpixels * _FINE))
-    for cell in range(subpixels * _FINE):
-        low = (cell + 0.5) / _FINE - 0.5 - 0.5 * width
+    width = np.sqrt(1.0 - fine**-2.0)
+    reach = count // 2
+    points, weights = np.polynomial.legendre.leggauss(count // 2)
+    nodes = np.arange(count)
+    shares = np.zeros((subpixels + 2 * reach, subpixels * fine))
+    for cell in range(subpixels * fine):
+        low = (cell + 0.5) / fine - 0.5 - 0.5 * width
         # The polynomials change where the nearest nodes do: the two parts are integrated apart, each exactly.
         change = min(np.floor(low) + 1.0, low + width)
         for start, end in ((low, change), (change, low + width)):

@@ -52,20 +52,22 @@ def _add(sum_: Drizzle, exposure: FloatArray, geometry: Geometry, index: int, we
     )
 
 
-def drizzle(exposures: FloatArray, geometry: Geometry) -> FloatArray:
-    """Drizzle exposures onto the output grid with :func:`even_weights`, by the package in its single precision.
+def drizzle(exposures: FloatArray, geometry: Geometry, *, balanced: bool = True) -> FloatArray:
+    """Drizzle exposures onto the output grid, by the package in its single precision.
 
     Parameters
     ----------
     exposures
         (n_dither, ny, nx) flux per native pixel.
+    balanced
+        With :func:`even_weights`, or with equal ones.
 
     Returns
     -------
     geometry.drizzled_shape, flux per drizzled pixel; NaN where no droplet falls.
     """
     _check_exposures(exposures, geometry)
-    maps = even_weights(geometry)
+    maps = even_weights(geometry) if balanced else [None] * geometry.n_dither
     total = Drizzle(kernel=geometry.kernel, out_shape=geometry.drizzled_shape, disable_ctx=True)
     for index, exposure in enumerate(exposures):
         _add(total, exposure, geometry, index, maps[index])

@@ -24,13 +24,15 @@ from engine.imaging.pupil import pupil_transmission, pupil_wavefront
 from engine.spec.instrument import Camera
 
 PUPIL_PIXELS = 512
+STAMP_SIDE = 10.4
+"""Of the PSF [arcsec]."""
 
 
 def telescope_psf(
     camera: Camera,
     *,
     oversampling: int | None = None,
-    field_of_view: float = 10.4,
+    field_of_view: float = STAMP_SIDE,
     defocus_nm: float = 0.0,
     jitter: float = 0.0,
     pupil_pixels: int = PUPIL_PIXELS,

@@ -18,7 +18,7 @@ from engine.conventions import FloatArray
 from engine.errors import PosteriorError
 from engine.posterior.convergence import split_r_hat
 from engine.posterior.optimum import Laplace
-from engine.posterior.surrogate import learn_surrogate
+from engine.posterior.surrogate import USUAL_SCHOOLING, Schooling, learn_surrogate
 from engine.posterior.target import Prior, Recorded, Target
 from engine.result import ChainStatus, ChainSummary
 from engine.work import count
@@ -84,6 +84,7 @@ def run_chain(
     length: float = AUTOCORRELATION_TIMES,
     rng: np.random.Generator,
     progress: Callable[[float], None] | None = None,
+    schooling: Schooling = USUAL_SCHOOLING,
 ) -> Chain:
     """Sample the target until the chain is ``length`` autocorrelation times long, or ``max_steps`` are spent.
 
@@ -101,7 +102,7 @@ def run_chain(
     if laplace.known is not None:
         known = Recorded(target, list(laplace.known[0]), laplace.known[1].tolist())
     before = target.evaluations
-    sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random)
+    sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random, schooling)
     tau, steps, left = math.inf, 0, _RESTARTS
     while steps < max_steps and steps < length * tau:
         state = sampler.run_mcmc(state, min(_CHUNK, max_steps - steps), skip_initial_state_check=True)
@@ -113,7 +114,7 @@ def run_chain(
             left -= 1
             for values, found in zip(state.coords, state.log_prob, strict=True):
                 known.remember(values, float(found))
-            sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random)
+            sampler, state = _on_surrogate(known, target.prior, laplace, walkers, random, schooling)
             tau, steps = math.inf, 0
     if not math.isfinite(tau):
         raise PosteriorError(f"chain: no proposal was accepted in {steps} steps of {walkers} walkers")
@@ -133,10 +134,15 @@ def run_chain(
 
 
 def _on_surrogate(
-    known: Recorded, prior: Prior, laplace: Laplace, walkers: int, random: np.random.RandomState
+    known: Recorded,
+    prior: Prior,
+    laplace: Laplace,
+    walkers: int,
+    random: np.random.RandomState,
+    schooling: Schooling,
 ) -> tuple[emcee.EnsembleSampler, emcee.State]:
     """A sampler that walks on a surrogate of all that is known and some more, and where it stands after a burn-in."""
-    surrogate = learn_surrogate(known, prior, laplace, random)
+    surrogate = learn_surrogate(known, prior, laplace, random, schooling)
     moves = [(emcee.moves.MHMove(surrogate), _SURROGATE_SHARE)]
     if walkers >= 2 * laplace.mean.size:
         moves.append((emcee.moves.DEMove(), 1.0 - _SURROGATE_SHARE))

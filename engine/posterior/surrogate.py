@@ -10,6 +10,8 @@ invariant however wrong the surrogate is; a wrong one costs acceptance.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
@@ -40,11 +42,24 @@ _ENOUGH = 10
 """Places near the maximum that tell how large the error is."""
 _MOST_KNOWN = 800
 """The latest evaluations that are learnt from: the process costs the cube of their number."""
-_GOOD = 0.3
-"""Error of ln of the target (rms, near its maximum) at which the surrogate has learnt enough."""
-_POPULATION, _LONG_WALK, _WALK = 200, 100, 40
+_POPULATION, _LONG_WALK = 200, 100
 _RANDOM_WALK, _STRETCH = 0.7, 0.5
 """Length of random-walk steps in deviations, and the scatter of its logarithm."""
+
+
+@dataclass(frozen=True)
+class Schooling:
+    """What a surrogate learns, and how far walks on it go; :mod:`engine.accuracy.sampling` measures what each gains.
+
+    ``good`` is the error of ln of the target (rms, near its maximum) at which it has learnt enough, ``walk`` the number
+    of steps of a walk.
+    """
+
+    good: float = 0.3
+    walk: int = 40
+
+
+USUAL_SCHOOLING = Schooling()
 
 
 def ln_core(z2: FloatArray) -> FloatArray:
@@ -56,13 +71,20 @@ def ln_core(z2: FloatArray) -> FloatArray:
 class Surrogate:
     """The surrogate that is learnt from ``values`` (n,) of ln of the target at ``points`` (n, d).
 
-    ``mean`` (d,) and ``covariance`` (d, d) are of the Gaussian approximation on which it rests.
+    ``mean`` (d,) and ``covariance`` (d, d) are of the Gaussian approximation on which it rests; ``steps`` are those of
+    a move.
     """
 
     def __init__(
-        self, prior: Prior, points: FloatArray, values: FloatArray, mean: FloatArray, covariance: FloatArray
+        self,
+        prior: Prior,
+        points: FloatArray,
+        values: FloatArray,
+        mean: FloatArray,
+        covariance: FloatArray,
+        steps: int = USUAL_SCHOOLING.walk,
     ) -> None:
-        self.prior, self.proposal = prior, StudentProposal(mean, covariance)
+        self.prior, self.proposal, self.steps = prior, StudentProposal(mean, covariance), steps
         top = float(values.max())
         z = self.proposal.whiten(points)
         differs = np.maximum(values, top - _DEPTH) - ln_core((z**2).sum(axis=1))
@@ -127,21 +149,32 @@ class Surrogate:
 
     def __call__(self, states: FloatArray, random: np.random.RandomState) -> tuple[FloatArray, FloatArray]:
         """The move: where walks from the states end, and ln of the ratio that makes up for it; emcee's protocol."""
-        there, ln_there, ln_here = self.walk(states, _WALK, random, _WARMTH)
+        there, ln_there, ln_here = self.walk(states, self.steps, random, _WARMTH)
         return there, (ln_here - ln_there) / _WARMTH
 
 
 def fit_surrogate(
-    known: Recorded, prior: Prior, mean: FloatArray, covariance: FloatArray, random: np.random.RandomState
+    known: Recorded,
+    prior: Prior,
+    mean: FloatArray,
+    covariance: FloatArray,
+    random: np.random.RandomState,
+    steps: int = USUAL_SCHOOLING.walk,
 ) -> tuple[Surrogate, FloatArray]:
     """The surrogate of all that is known, resting on its own mean and covariance, and a population (n, d) of it."""
     points, values = known.latest(_MOST_KNOWN)
     population = Surrogate(prior, points, values, mean, covariance).draw(_POPULATION, random)
     mean, covariance = population.mean(axis=0), np.cov(population.T)
-    return Surrogate(prior, points, values, mean, covariance), population
+    return Surrogate(prior, points, values, mean, covariance, steps), population
 
 
-def learn_surrogate(known: Recorded, prior: Prior, laplace: Laplace, random: np.random.RandomState) -> Surrogate:
+def learn_surrogate(
+    known: Recorded,
+    prior: Prior,
+    laplace: Laplace,
+    random: np.random.RandomState,
+    schooling: Schooling = USUAL_SCHOOLING,
+) -> Surrogate:
     """Evaluate the target where the surrogate says that it is high, until they agree.
 
     Raises
@@ -153,16 +186,21 @@ def learn_surrogate(known: Recorded, prior: Prior, laplace: Laplace, random: np.
         known.many(StudentProposal(laplace.mean, _TEMPERATURE * laplace.covariance).draw(_FIRST, random))
     if not known.values:
         raise PosteriorError("chain: the target is nothing anywhere that the Gaussian approximation proposes")
-    surrogate, population = fit_surrogate(known, prior, laplace.mean, laplace.covariance, random)
+    surrogate, population = fit_surrogate(known, prior, laplace.mean, laplace.covariance, random, schooling.walk)
     for batch in _BATCHES:
-        places, expected, _ = surrogate.walk(population[:batch], _WALK, random, _TEMPERATURE)
+        places, expected, _ = surrogate.walk(population[:batch], schooling.walk, random, _TEMPERATURE)
         top = max(known.values)
         found = known.many(places)
         near = found > top - 0.5 * places.shape[1] - 4.0
         error = (found - expected)[near]
         surrogate, population = fit_surrogate(
-            known, prior, surrogate.proposal.mean, surrogate.proposal.root @ surrogate.proposal.root.T, random
+            known,
+            prior,
+            surrogate.proposal.mean,
+            surrogate.proposal.root @ surrogate.proposal.root.T,
+            random,
+            schooling.walk,
         )
-        if error.size >= _ENOUGH and float(error.std()) < _GOOD:
+        if error.size >= _ENOUGH and float(error.std()) < schooling.good:
             break
     return surrogate

@@ -95,7 +95,7 @@ def montage(
         from engine.figures import montage_figure  # noqa: PLC0415
 
         observations = []
-        with _progress(f"simulating {system}", len(runs)) as advance:
+        with progress_bar(f"simulating {system}", len(runs)) as advance:
             for run in runs:
                 observations.append(simulate_realization(run.realization).observation)
                 advance()
@@ -119,7 +119,7 @@ def gallery(
         from engine.figures import gallery_figure  # noqa: PLC0415
 
         simulations: list[Simulation] = []
-        with _progress("simulating the eight systems", len(runs)) as advance:
+        with progress_bar("simulating the eight systems", len(runs)) as advance:
             for run in runs:
                 simulations.append(simulate_realization(run.realization))
                 advance()
@@ -156,7 +156,7 @@ def inversion(
         from engine import inspect_simulation, simulate_realization  # noqa: PLC0415 - as above
         from engine.figures import inversion_figure  # noqa: PLC0415
 
-        with _progress(f"inverting {realization.system_name}", 3) as advance:
+        with progress_bar(f"inverting {realization.system_name}", 3) as advance:
             simulation = simulate_realization(realization)
             advance()
             view = inspect_simulation(simulation, realization.analysis)
@@ -240,7 +240,7 @@ def _write_one(realization: Realization, out: Path) -> None:
     from engine import simulate_realization, write_observation  # noqa: PLC0415 - as above
     from engine.figures import simulation_figure  # noqa: PLC0415
 
-    with _progress(f"simulating {realization.system_name}", 3) as advance:
+    with progress_bar(f"simulating {realization.system_name}", 3) as advance:
         simulation = simulate_realization(realization)
         advance()
         write_observation(out / f"{stem}.fits", simulation.observation, overwrite=True)
@@ -260,7 +260,8 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 @contextmanager
-def _progress(what: str, steps: int) -> Iterator[Any]:
+def progress_bar(what: str, steps: int) -> Iterator[Any]:
+    """A bar on a terminal; what it yields advances it by one step."""
     from rich.console import Console  # noqa: PLC0415 - as the engine
     from rich.progress import (  # noqa: PLC0415 - as above
         BarColumn,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import maximum_filter
 
+from engine.accuracy.light_reference import flux_through_the_sides, graded_fluxes, supersampled
 from engine.errors import SpecError
 from engine.lensing.power_law import PowerLawLens, source_position
 from engine.light import radial_table, refinement, rendering
@@ -13,14 +14,7 @@ from engine.light.brightness_bounds import brightness_range
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
 from engine.light.rendering import render_sersic, sample_sersic
 from engine.light.sersic import SersicProfile, mean_surface_brightness, sersic_constants, sersic_k, surface_brightness
-from tests.engine.light_oracle import (
-    GRID,
-    HE0435,
-    assert_as_promised,
-    flux_through_the_sides,
-    graded_fluxes,
-    supersampled,
-)
+from tests.engine.light_oracle import GRID, HE0435, assert_as_promised
 
 # The profile
 

@@ -4,20 +4,13 @@ import numpy as np
 import pytest
 
 from engine import Host, Realization
+from engine.accuracy.light_reference import flux_through_the_sides, graded_fluxes, supersampled
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic
 from engine.light.sersic import SersicProfile
 from engine.simulation.scene import build_scene
-from tests.engine.light_oracle import (
-    GRID,
-    HE0435,
-    assert_as_promised,
-    flux_through_the_sides,
-    fold,
-    graded_fluxes,
-    supersampled,
-)
+from tests.engine.light_oracle import GRID, HE0435, assert_as_promised, fold
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0), (0.05, 0.05), (0.05, 0.0), (0.013, 0.021)], ids=str)

@@ -138,6 +138,10 @@ WRONG = {
     "an inversion without suffix": ("inversion", "HE0435", "--out", "x"),
     "an inversion into a file": ("inversion", "HE0435", "--out", "list.json/x.png"),
     "an inversion with a name too long": ("inversion", "HE0435", "--out", "x" * 300 + ".png"),
+    "speed against error of no system": ("accuracy", "HE0436"),
+    "speed against error of no stage": ("accuracy", "HE0435", "none"),
+    "speed against error as text": ("accuracy", "HE0435", "--json", "x.txt"),
+    "speed against error, files of one name": ("accuracy", "HE0435", "--figure", "x.png", "--figure", "none/x.png"),
     "an unknown profile": ("inversion", "HE0435", "--profile", "none"),
     "no source pixels": ("inversion", "HE0435", "--source-pixels", "0"),
     "too many source pixels": ("inversion", "HE0435", "--source-pixels", "1000000"),
@@ -342,6 +346,7 @@ def test_help_and_mistakes_load_nothing_that_takes_long(tmp_path: Path) -> None:
         ["nonsense"], ["results", "--where", "system"], ["submit", "--analysis", "draws"],
         ["submit", "--file", "nowhere.json"], ["submit", "--system", "nowhere.toml"], ["simulate", "nowhere.toml"],
         ["measure", "nowhere.fits"], ["inversion", "HE0435", "--out", "x.txt"], ["simulate", "HE0435", "--n", "two"],
+        ["accuracy", "HE0435", "--json", "x.txt"],
     ]  # fmt: skip
     assert_light(tmp_path, commands, slow)
 
@@ -356,6 +361,7 @@ def test_mistakes_that_only_the_engine_can_tell_load_nothing_that_computes(tmp_p
         ["simulate", "HE0435", "--n", "99"], ["simulate", "HE0435", "--mass-model", "none"],
         ["simulate", "HE0435", "--camera", "none"], ["simulate", "HE0435", "--l-eta", "3"], ["montage", "HE0436"],
         ["gallery", "--noise-level", "none"], ["inversion", "HE0435", "--profile", "none"],
+        ["accuracy", "HE0436"], ["accuracy", "HE0435", "none"],
     ]  # fmt: skip
     assert_light(tmp_path, commands, slow)
 
