@@ -48,16 +48,27 @@ def own_parameter(name: LensParameterName) -> bool:
 
 
 @dataclass(frozen=True)
+class KnownLight:
+    """What is known of the light of a deflector whose shape is not fitted: centre [arcsec], (e1, e2), its Gaussians."""
+
+    centre: tuple[float, float]
+    ellipticity: tuple[float, float]
+    gaussians: tuple[SersicProfile, ...]
+
+
+@dataclass(frozen=True)
 class ParameterSpace:
     """Which components the model has, and where their parameters stand in a vector.
 
     A vector is [AGN x, y ...][deflector: SHAPE][lens: theta_E, e1, e2, slope, x, y and gamma1, gamma2 with shear]
-    [host: SHAPE]; the amplitudes, which are linear, are [AGN ...][deflector][host][background].
+    [host: SHAPE]; the amplitudes, which are linear, are [AGN ...][deflector][host][background]. Where the deflector's
+    light is Gaussians of known shape (``light``) it has no parameters, and as many amplitudes as there are Gaussians.
     """
 
     n_agn: int
     deflector: bool
     shear: bool
+    light: KnownLight | None = None
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -96,7 +107,12 @@ class ParameterSpace:
     @property
     def amplitudes(self) -> int:
         """Number of linear ones."""
-        return self.n_agn + int(self.deflector) + 2
+        return self.n_agn + int(self.deflector) + self.gaussians + 2
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians that the deflector's light is made of."""
+        return 0 if self.light is None else len(self.light.gaussians)
 
     def agn(self, values: FloatArray) -> FloatArray:
         """Positions (n_agn, 2) [arcsec] of the AGN images."""

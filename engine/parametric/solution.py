@@ -28,7 +28,8 @@ class Solution:
     """A minimum between bounds: the model it belongs to, its parameters, bounds and cost (chi^2 and priors).
 
     ``start`` is where the search for it began; ``stamp_error`` is the error of the light of AGN images that its noise
-    map holds, in units of what the optics allow for.
+    map holds, in units of what the optics allow for. ``noise`` (ny, nx) is the model's without the error of the arcs,
+    where that has one: no host is a Sersic profile.
     """
 
     model: ImageModel
@@ -38,6 +39,7 @@ class Solution:
     cost: float
     start: Start
     stamp_error: float = 1.0
+    noise: FloatArray | None = None
 
     @property
     def space(self) -> ParameterSpace:
