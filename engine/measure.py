@@ -240,7 +240,8 @@ def measure_image(
     rng = np.random.default_rng(seed)
     found = analyse(
         observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
-        shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
+        shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, real_galaxy=True,
+        progress=progress,
     )  # fmt: skip
     fit, orientation = found.fit, observation.orientation
     if inversion:

@@ -121,6 +121,7 @@ def analyse(
     acceptance: Acceptance = GOOD_START,
     fixed_index: float | None = None,
     fit: ParametricFit | None = None,
+    real_galaxy: bool = False,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Reconstruct the host galaxy in an observation of any origin.
@@ -132,7 +133,7 @@ def analyse(
         Estimators and priors; source grid, regularisation, noise treatment, mask and chain of the inversion.
     rng : Generator
         For the chain and the draws; not used where there is no inversion.
-    agn_images, deflector, shear, theta_E, positions, acceptance
+    agn_images, deflector, shear, theta_E, positions, acceptance, real_galaxy
         What the observer sees and accepts, as :func:`~engine.parametric.fit.fit_parametric` takes it.
     fixed_index : float, optional
         The n at which the fixed-n estimates hold it; without it there are none.
@@ -154,6 +155,7 @@ def analyse(
                 fit = fit_parametric(
                     observation, agn_images=agn_images, deflector=deflector, shear=shear, theta_E=theta_E,
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
+                    real_galaxy=real_galaxy,
                 )  # fmt: skip
         inversion = _sample(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)

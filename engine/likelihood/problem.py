@@ -63,6 +63,10 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
     if fit.deflector is not None:
         names.append("deflector")
         images.append(observation.optics.sersic_image(fit.deflector) / fit.deflector.flux)
+    elif fit.deflector_gaussians:
+        names.append("deflector")
+        total = sum(one.flux for one in fit.deflector_gaussians)
+        images.append(sum(observation.optics.sersic_image(one) for one in fit.deflector_gaussians) / total)
     names.append("background")
     images.append(np.ones(observation.shape))
     return tuple(names), np.stack(images)

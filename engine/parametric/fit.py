@@ -8,7 +8,7 @@ whole of it (:mod:`.refine`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -19,9 +19,10 @@ from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, profile_of
 from engine.parametric.constraints import worst_miss
+from engine.parametric.galaxies import asks_for_galaxy, with_galaxy
 from engine.parametric.host_posterior import HostPosterior
 from engine.parametric.model import ImageModel
-from engine.parametric.parameters import BACKGROUND, HOST_FLUX
+from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
@@ -41,9 +42,11 @@ class ParametricFit:
 
     ``host.flux`` and ``deflector.flux`` are the fitted fluxes [e-/s]; ``agn`` are the fitted positions and fluxes;
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, all other parameters free,
-    multiplied by chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma``
+    multiplied by chi^2 per degree of freedom where that is above one. A deflector that is more than one profile is
+    ``deflector_gaussians``, and ``deflector`` is None. ``chi2`` counts the fitted pixels with ``sigma``
     (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
-    times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
+    times what is allowed for moved stamps the residuals at AGN images show, ``arc_error`` by which part of their light
+    the covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of the host
     with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
     of the lensed host [e-/s].
     """
@@ -51,6 +54,7 @@ class ParametricFit:
     lens: PowerLawLens
     host: SersicProfile
     deflector: SersicProfile | None
+    deflector_gaussians: tuple[SersicProfile, ...]
     agn: tuple[Detection, ...]
     background: float
     lens_names: tuple[str, ...]
@@ -59,6 +63,7 @@ class ParametricFit:
     chi2: float
     degrees_of_freedom: int
     stamp_error: float
+    arc_error: float
     at_bound: tuple[str, ...]
     model: FloatArray
     arc: FloatArray
@@ -81,6 +86,7 @@ def fit_parametric(
     acceptance: Acceptance = GOOD_START,
     priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
     fixed_index: float | None = None,
+    real_galaxy: bool = False,
 ) -> ParametricFit:
     """Find lens, AGN images and host, from nothing but the observation.
 
@@ -103,6 +109,8 @@ def fit_parametric(
         What is known of lens parameters, by name, instead of the wide priors that hold otherwise.
     fixed_index : float, optional
         An index at which the host's n is held for one more of its posteriors.
+    real_galaxy : bool
+        Whether a deflector may be more than one Sersic profile, where the residuals ask for it.
 
     Raises
     ------
@@ -119,10 +127,14 @@ def fit_parametric(
     task = Task(observation, deflector, shear, acceptance, priors)
     groups = find_starts(task, agn_images, theta_E, positions)
     refusals: list[str] = []
+    told = positions is not None or agn_images is not None
     for wave in (groups, [varied_starts(group) for group in groups]):
         for solution in ranked(task, [quick_fits(task, group) for group in wave]):
             try:
-                return fit_of(task, polished(task, solution), fixed_index)
+                best = polished(task, solution)
+                if real_galaxy and deflector and asks_for_galaxy(best):
+                    best = with_galaxy(task, best, theta_E, agn_told=told)
+                return fit_of(task, best, fixed_index)
             except PosteriorError as error:
                 refusals.append(str(error))
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
@@ -133,7 +145,8 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     model, values, space = solution.model, solution.values, solution.space
     jacobian, amplitudes = model.full_jacobian(values)
     _, rest, _ = model.amplitudes(values)
-    chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes
+    covered, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes
+    chi2 = covered if solution.noise is None else _chi2_of(solution, rest, solution.noise)
     flux = float(amplitudes[HOST_FLUX])
     if not flux > 0:
         raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
@@ -147,17 +160,20 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         raise PosteriorError(
             f"parametric model: an AGN image maps {miss:.3f} arcsec from the host, {task.acceptance.miss:g} are allowed"
         )
-    inflation = max(1.0, chi2 / freedom)
+    inflation = max(1.0, covered / freedom)
     covariance = inflation * parameter_covariance(model, jacobian)
     hosts = host_posteriors(solution, covariance, inflation, fixed_index)
     shape = task.observation.shape
-    shown = ImageModel(task.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True)
+    shown = ImageModel(
+        task.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True, galaxy=model.galaxy
+    )
     columns = shown.columns(values)
     deflector = profile_of(values[space.deflector_slice], float(amplitudes[space.n_agn])) if space.deflector else None
     return ParametricFit(
         lens=solution.lens,
         host=space.host(values, flux),
         deflector=deflector,
+        deflector_gaussians=_gaussians(space, amplitudes),
         agn=solution.agn(),
         background=float(amplitudes[BACKGROUND]),
         lens_names=space.lens_names,
@@ -166,8 +182,24 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         chi2=chi2,
         degrees_of_freedom=freedom,
         stamp_error=solution.stamp_error,
+        arc_error=solution.arc_error,
         at_bound=solution.at_bound,
         model=(columns @ amplitudes).reshape(shape),
         arc=(columns[:, HOST_FLUX] * flux).reshape(shape),
-        sigma=model.sigma,
+        sigma=model.sigma if solution.noise is None else solution.noise,
     )
+
+
+def _gaussians(space: ParameterSpace, amplitudes: FloatArray) -> tuple[SersicProfile, ...]:
+    """The Gaussians that the deflector's light is made of, with their fluxes."""
+    if space.light is None:
+        return ()
+    fluxes = amplitudes[space.n_agn : space.n_agn + space.gaussians].tolist()
+    return tuple(replace(one, flux=flux) for one, flux in zip(space.light.gaussians, fluxes, strict=True) if flux > 0)
+
+
+def _chi2_of(solution: Solution, rest: FloatArray, noise: FloatArray) -> float:
+    """chi^2 of whitened residuals with the noise that does not let the arcs be off."""
+    counted = np.isfinite(noise) & np.isfinite(solution.model.sigma)
+    ratio = np.where(counted, solution.model.sigma, 0.0) / np.where(counted, noise, 1.0)
+    return float(np.sum((rest.reshape(noise[solution.model.window].shape) * ratio[solution.model.window]) ** 2))

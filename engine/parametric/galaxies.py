@@ -14,6 +14,7 @@ from engine.parametric.galaxy_light import GalaxyFit, GalaxyImages, GalaxyLight,
 from engine.parametric.model import ImageModel, weights_sigma, window_round
 from engine.parametric.parameters import HOST_FLUX, KnownLight, ParameterSpace
 from engine.parametric.refine import full_fit, fitted_sigma, measured_arc_error
+from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Task
 from engine.parametric.solution import Solution, minimise
 
@@ -33,6 +34,81 @@ _RIVAL = 1.3
 _APART = 0.02
 """Logarithm of the ratio of Einstein radii below which two quick fits have found the same."""
 _ARC_ROUNDS = 2
+_LEAST_FIELD = 25.0
+"""Pixels."""
+_WORTH, _PART = 30.0, 0.01
+"""What a Gaussian must lower chi^2 by, and all of them together in its own units, for the galaxy to be worth a fit."""
+DESCRIBED = 1.5
+"""chi^2 per pixel up to which a galaxy without AGN needs none."""
+
+
+def asks_for_galaxy(solution: Solution) -> bool:
+    """Whether a deflector of more than one profile would lower the chi^2 of a fit by more than its parameters may.
+
+    All that the fit knows is free to follow to first order: one linear solution, not another fit (Rao's score test).
+    """
+    model, space, values = solution.model, solution.space, solution.values
+    jacobian, _ = model.full_jacobian(values)
+    _, rest, _ = model.amplitudes(values)
+    basis, _ = np.linalg.qr(jacobian[: model.data.size])
+    shape = values[space.deflector_slice]
+    _, e1, e2, x, y = shape[1:].tolist()
+    scale = model.observation.pixel_scale
+    light = first_light((x, y), max(_LEAST_FIELD * scale, _FIELD_RADII * solution.lens.theta_E), scale, (e1, e2))
+    images = GalaxyImages(model.observation, model.window)(light).reshape(light.size, -1)
+    more = (images * model.weight).T
+    more = more - basis @ (basis.T @ more)
+    basis, _ = np.linalg.qr(more)
+    gain = float(np.sum((basis.T @ rest) ** 2))
+    misfit = max(float(rest @ rest) / model.pixels, 1e-300)
+    return gain > _WORTH * light.size * misfit and gain > _PART * float(rest @ rest)
+
+
+def with_galaxy(task: Task, first: Solution, theta_E: float | None, *, agn_told: bool) -> Solution:
+    """The better of the fits with a deflector of Gaussians: without AGN, and with those of the ``first`` fit."""
+    found: list[Solution] = []
+    if not (agn_told and first.space.n_agn):
+        try:
+            found.append(galaxy_fit(task, theta_E))
+        except PosteriorError:
+            if not first.space.n_agn:
+                return first
+    if first.space.n_agn and not (found and misfit_of(task, found[0]) < DESCRIBED):
+        found += [first, _behind_galaxy(task, first, theta_E)]
+    return min(found, key=lambda one: misfit_of(task, one))
+
+
+def misfit_of(task: Task, solution: Solution) -> float:
+    """chi^2 per pixel of a full fit, in the scatter outside the lens."""
+    amplitudes, _, columns = solution.model.amplitudes(solution.values)
+    noise = solution.model.sigma if solution.noise is None else solution.noise
+    counted = np.isfinite(noise) & np.isfinite(solution.model.sigma)
+    residual = np.where(counted, task.observation.image - solution.model.unwhitened(columns, amplitudes), 0.0)
+    scale = noise_scale(task.observation, residual, np.where(counted, noise, np.inf), solution.lens) or 1.0
+    return float(np.mean((residual[counted] / noise[counted]) ** 2)) / scale**2
+
+
+def _behind_galaxy(task: Task, first: Solution, theta_E: float | None) -> Solution:
+    """The fit that begins at another one, with Gaussians instead of its deflector."""
+    sigma, reach = _searched(task, theta_E)
+    light = first_light(task.centre, reach, task.observation.pixel_scale)
+    galaxy = fit_galaxy(task.observation, task.observation.image - _without_deflector(first), sigma, light)
+    known, images = _known(task, galaxy.light, galaxy.fluxes)
+    space = replace(first.space, deflector=False, light=known)
+    values = np.delete(first.values, first.space.deflector_slice)
+    model = ImageModel(
+        task.observation, space, first.model.sigma, first.model.window, subrays=1, exact=False, priors=task.priors,
+        galaxy=images,
+    )  # fmt: skip
+    low, high = space.bounds(values, task.observation.pixel_scale, task.priors)
+    return _with_arc_error(task, replace(first, model=model, values=values, low=low, high=high))
+
+
+def _without_deflector(solution: Solution) -> FloatArray:
+    """Image (ny, nx) of AGN and arcs."""
+    amplitudes, _, columns = solution.model.amplitudes(solution.values)
+    chosen = [*range(solution.space.n_agn), solution.space.amplitudes + HOST_FLUX]
+    return solution.model.unwhitened(columns[:, chosen], amplitudes[chosen])
 
 
 def galaxy_fit(task: Task, theta_E: float | None) -> Solution:
@@ -104,10 +180,9 @@ def _quick_fits(task: Task, galaxy: GalaxyFit, sigma: FloatArray, theta_E: float
 
 def _full(task: Task, solution: Solution, light: GalaxyLight, sigma: FloatArray, noise: FloatArray) -> Solution:
     """The full fit from a quick one, with Gaussians that are fitted to what its arcs leave."""
-    amplitudes, _, columns = solution.model.amplitudes(solution.values)
-    others = [*range(solution.space.n_agn), solution.space.amplitudes + HOST_FLUX]
-    shown = solution.model.unwhitened(columns[:, others], amplitudes[others])
-    galaxy = fit_galaxy(task.observation, task.observation.image - shown, sigma, light, rounds=1)
+    galaxy = fit_galaxy(
+        task.observation, task.observation.image - _without_deflector(solution), sigma, light, rounds=1
+    )
     known, images = _known(task, galaxy.light, galaxy.fluxes)
     space = replace(solution.space, light=known)
     old = solution.model
@@ -121,9 +196,9 @@ def _with_arc_error(task: Task, solution: Solution) -> Solution:
     """The fit in which arcs may be off by the part of their light that the residuals show."""
     for _ in range(_ARC_ROUNDS):
         noise = fitted_sigma(task, solution)
-        variance = measured_arc_error(task, solution, noise)
+        part, variance = measured_arc_error(task, solution, noise)
         solution = full_fit(task, solution, np.sqrt(noise**2 + variance), shear=task.may_shear)
-        solution = replace(solution, noise=noise)
+        solution = replace(solution, noise=noise, arc_error=part)
     return solution
 
 

@@ -22,6 +22,9 @@ HOST_FLUX, BACKGROUND = -2, -1
 """Places among the amplitudes."""
 
 SLOPE_RANGE, SHEAR_RANGE = (1.3, 2.7), (-0.4, 0.4)
+GALAXY_SLOPES, GALAXY_SHEARS = (1.5, 2.6), (-0.2, 0.2)
+"""Behind a galaxy that is more than one profile; its (e1, e2) and centre are within these of those of its light."""
+_LIGHT_REACH, _LIGHT_OFFSET = 0.25, 0.12
 _ELLIPTICITY_RANGE = (-0.6, 0.6)
 _EINSTEIN_RADII = (0.4, 1.8)
 """Bounds of theta_E in units of where a fit begins; the host lies within one theta_E of the lens."""
@@ -162,8 +165,13 @@ class ParameterSpace:
         near = [(x - _CENTRE_REACH, x + _CENTRE_REACH), (y - _CENTRE_REACH, y + _CENTRE_REACH)]
         sides = [(value - reach, value + reach) for value in start[: 2 * self.n_agn].tolist()]
         sides += [_logs(_DEFLECTOR_RADII), _DEFLECTOR_INDICES, e, e, *near] if self.deflector else []
-        sides += [(_EINSTEIN_RADII[0] * theta_E, _EINSTEIN_RADII[1] * theta_E), e, e, SLOPE_RANGE, *near]
-        sides += [SHEAR_RANGE, SHEAR_RANGE] if self.shear else []
+        shapes, slopes, shears = [e, e], SLOPE_RANGE, SHEAR_RANGE
+        if self.light is not None:
+            shapes = [(value - _LIGHT_REACH, value + _LIGHT_REACH) for value in self.light.ellipticity]
+            near = [(value - _LIGHT_OFFSET, value + _LIGHT_OFFSET) for value in self.light.centre]
+            slopes, shears = GALAXY_SLOPES, GALAXY_SHEARS
+        sides += [(_EINSTEIN_RADII[0] * theta_E, _EINSTEIN_RADII[1] * theta_E), *shapes, slopes, *near]
+        sides += [shears, shears] if self.shear else []
         sides += [_logs(_HOST_RADII), INDEX_RANGES["wide"], e, e]
         sides += [(x - theta_E, x + theta_E), (y - theta_E, y + theta_E)]
         low, high = np.array(sides).T

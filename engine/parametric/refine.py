@@ -121,8 +121,8 @@ def _fitted(task: Task, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray
     return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
 
 
-def measured_arc_error(task: Task, solution: Solution, sigma: FloatArray) -> FloatArray:
-    """Variance (ny, nx) of the arcs of a full fit: a part of their light, as large as the residuals show.
+def measured_arc_error(task: Task, solution: Solution, sigma: FloatArray) -> tuple[float, FloatArray]:
+    """By which part of their light the arcs of a full fit are off, as the residuals show it; their variance (ny, nx).
 
     ``sigma`` is that of all else. Real hosts have clumps and arms: what they miss of a Sersic profile is no noise.
     """
@@ -134,7 +134,7 @@ def measured_arc_error(task: Task, solution: Solution, sigma: FloatArray) -> Flo
     scale = noise_scale(task.observation, residual, sigma, solution.lens) or 1.0
     others = np.where(counted, sigma**2 + (scale**2 - 1.0) * weights_sigma(task.observation) ** 2, np.inf)
     part = measured_stamp_error(residual, arc**2, others, _ARC_ERRORS)
-    return np.zeros(arc.shape) if part is None else (part * arc) ** 2
+    return (0.0, np.zeros(arc.shape)) if part is None else (part, (part * arc) ** 2)
 
 
 def _stamp_error(task: Task, solution: Solution) -> float | None:

@@ -29,7 +29,7 @@ class Solution:
 
     ``start`` is where the search for it began; ``stamp_error`` is the error of the light of AGN images that its noise
     map holds, in units of what the optics allow for. ``noise`` (ny, nx) is the model's without the error of the arcs,
-    where that has one: no host is a Sersic profile.
+    where that has one, ``arc_error`` that part of their light: no host is a Sersic profile.
     """
 
     model: ImageModel
@@ -40,6 +40,7 @@ class Solution:
     start: Start
     stamp_error: float = 1.0
     noise: FloatArray | None = None
+    arc_error: float = 0.0
 
     @property
     def space(self) -> ParameterSpace:
