@@ -76,7 +76,7 @@ def _centre(space: ParameterSpace, values: FloatArray) -> FloatArray:
     """Where the deflector shines [arcsec]; the middle of the frame where it does not."""
     if space.deflector:
         return values[space.deflector_slice][4:6]
-    return np.array((0.0, 0.0) if space.light is None else space.light.centre)
+    return np.array(space.middle if space.light is None else space.light.centre)
 
 
 def worst_miss(space: ParameterSpace, values: FloatArray) -> float:

@@ -7,6 +7,7 @@ whole of it (:mod:`.refine`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -27,7 +28,7 @@ from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
 from engine.parametric.solution import Solution
-from engine.parametric.uncertainty import host_posteriors, parameter_covariance
+from engine.parametric.uncertainty import host_posteriors, parameter_covariance, positive_mean
 from engine.result import IndexPrior
 from engine.spec.priors import LensParameterName, ParameterPrior
 
@@ -87,6 +88,7 @@ def fit_parametric(
     priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
     fixed_index: float | None = None,
     real_galaxy: bool = False,
+    centre: tuple[float, float] | None = None,
 ) -> ParametricFit:
     """Find lens, AGN images and host, from nothing but the observation.
 
@@ -110,7 +112,10 @@ def fit_parametric(
     fixed_index : float, optional
         An index at which the host's n is held for one more of its posteriors.
     real_galaxy : bool
-        Whether a deflector may be more than one Sersic profile, where the residuals ask for it.
+        Whether a deflector may be more than one Sersic profile, where the residuals ask for it, may stand anywhere, and
+        its host may be one that AGN images show alone.
+    centre : (x, y), optional
+        Where the deflector is, to half an arcsec [arcsec, image frame].
 
     Raises
     ------
@@ -124,7 +129,9 @@ def fit_parametric(
         raise SpecError("agn_images", agn_images, "a number from 0 to 8")
     if theta_E is not None and not 0 < theta_E < radius:
         raise SpecError("theta_E", theta_E, f"a radius on the image, below {radius:g}")
-    task = Task(observation, deflector, shear, acceptance, priors)
+    task = Task(
+        observation, deflector, shear, acceptance, priors, dark_host=real_galaxy, near=centre, anywhere=real_galaxy
+    )
     groups = find_starts(task, agn_images, theta_E, positions)
     refusals: list[str] = []
     told = positions is not None or agn_images is not None
@@ -148,7 +155,7 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     covered, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes
     chi2 = covered if solution.noise is None else _chi2_of(solution, rest, solution.noise)
     flux = float(amplitudes[HOST_FLUX])
-    if not flux > 0:
+    if not flux > 0 and not (task.dark_host and space.n_agn):
         raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
     if not freedom > 0 or chi2 > task.acceptance.chi2_per_dof * freedom:
         raise PosteriorError(
@@ -162,7 +169,9 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         )
     inflation = max(1.0, covered / freedom)
     covariance = inflation * parameter_covariance(model, jacobian)
-    hosts = host_posteriors(solution, covariance, inflation, fixed_index)
+    if not flux > 0:
+        flux = positive_mean(flux, math.sqrt(float(covariance[HOST_FLUX, HOST_FLUX])))
+    hosts = host_posteriors(solution, flux, covariance, inflation, fixed_index)
     shape = task.observation.shape
     shown = ImageModel(
         task.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True, galaxy=model.galaxy

@@ -66,12 +66,14 @@ class ParameterSpace:
     A vector is [AGN x, y ...][deflector: SHAPE][lens: theta_E, e1, e2, slope, x, y and gamma1, gamma2 with shear]
     [host: SHAPE]; the amplitudes, which are linear, are [AGN ...][deflector][host][background]. Where the deflector's
     light is Gaussians of known shape (``light``) it has no parameters, and as many amplitudes as there are Gaussians.
+    A lens that does not shine is about the ``middle`` [arcsec].
     """
 
     n_agn: int
     deflector: bool
     shear: bool
     light: KnownLight | None = None
+    middle: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

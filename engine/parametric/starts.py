@@ -17,8 +17,9 @@ from engine.parametric.lens_start import lens_from_positions
 from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import Detection
 
-_CENTRE_REACH = 0.5
+CENTRE_REACH = 0.5
 """Farthest [arcsec] that the deflector is looked for from the middle of the image."""
+_CENTROID_SIGMA, _CENTROID_ROUNDS, _CENTROID_RADIUS = 3.0, 12, 1.5
 _MOST_CANDIDATES = 6
 _CONSISTENT = 0.15
 """Misfit [arcsec] from which on positions are not the images of one source behind a power law without shear."""
@@ -59,18 +60,22 @@ def filled_image(observation: Observation) -> FloatArray:
     return np.where(observation.valid, observation.image, np.where(np.isfinite(smooth), smooth, level))
 
 
-def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, float] | None:
-    """The peak [arcsec] that is reached by climbing from the middle of the image, smoothed by a pixel.
+def deflector_centre(
+    image: FloatArray, pixel_scale: float, origin: tuple[float, float] = (0.0, 0.0)
+) -> tuple[float, float] | None:
+    """The peak [arcsec] that is reached by climbing from ``origin``, the image smoothed by a pixel.
 
-    None where the climb leaves the inner half arcsec, as without a deflector's light.
+    None where the climb leaves half an arcsec round it, as without a deflector's light, or the image.
     """
     smooth = ndimage.gaussian_filter(image, 1.0)
     ny, nx = image.shape
-    row, column = (ny - 1) // 2, (nx - 1) // 2
-    reach = max(1, round(_CENTRE_REACH / pixel_scale))
+    row, column = _pixel_at(image, pixel_scale, origin)
+    reach = max(1, round(CENTRE_REACH / pixel_scale))
     start_row, start_column = row, column
     while True:
         rows, columns = slice(row - 1, row + 2), slice(column - 1, column + 2)
+        if not (0 < row < ny - 1 and 0 < column < nx - 1):
+            return None
         step = np.unravel_index(int(np.argmax(smooth[rows, columns])), (3, 3))
         if int(step[0]) == 1 and int(step[1]) == 1:
             break
@@ -85,6 +90,45 @@ def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, floa
         (column + out[0] - (nx - 1) / 2.0) * pixel_scale,
         (row + out[1] - (ny - 1) / 2.0) * pixel_scale,
     )
+
+
+def _pixel_at(image: FloatArray, pixel_scale: float, place: tuple[float, float]) -> tuple[int, int]:
+    """Row and column of a place [arcsec]."""
+    ny, nx = image.shape
+    return math.floor(place[1] / pixel_scale + (ny - 1) / 2), math.floor(place[0] / pixel_scale + (nx - 1) / 2)
+
+
+def centre_of_light(image: FloatArray, noise: FloatArray, pixel_scale: float) -> tuple[float, float]:
+    """Centroid [arcsec] of what stands out of the sky, in ever smaller circles; the middle where nothing does.
+
+    AGN images and arcs surround their deflector, so that a lens is found which is nowhere near the middle.
+    """
+    y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
+    light = ndimage.gaussian_filter(image - float(np.median(image)), 1.0)
+    # The square root: the brightest image of an AGN is not to be the centre.
+    light = np.sqrt(np.where(light > _CENTROID_SIGMA * noise, np.maximum(light, 0.0), 0.0))
+    at_x, at_y, radius = 0.0, 0.0, 0.7 * max(image.shape) * pixel_scale
+    for _ in range(_CENTROID_ROUNDS):
+        inside = light * (np.hypot(x - at_x, y - at_y) < radius)
+        total = float(inside.sum())
+        if not total > 0:
+            return 0.0, 0.0
+        at_x, at_y = float((inside * x).sum()) / total, float((inside * y).sum()) / total
+        radius = max(0.75 * radius, _CENTROID_RADIUS)
+    return at_x, at_y
+
+
+def shows(
+    image: FloatArray,
+    noise: FloatArray,
+    pixel_scale: float,
+    place: tuple[float, float],
+    other: tuple[float, float],
+) -> bool:
+    """Whether at a place [arcsec] there shines more than noise, and not much less than at another."""
+    smooth = ndimage.gaussian_filter(image - float(np.median(image)), 1.0)
+    here, there = (smooth[_pixel_at(image, pixel_scale, at)] for at in (place, other))
+    return bool(here > 2.0 * _CENTROID_SIGMA * float(np.median(noise)) and here > 0.2 * there)
 
 
 def without_deflector(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> FloatArray:
