@@ -19,12 +19,13 @@ from engine.errors import InversionError, ObservationError, PosteriorError, Spec
 from engine.estimators.image import image_estimate
 from engine.imaging.observation import Observation
 from engine.imaging.readings import readings
+from engine.neighbours import without_lone_pixels, without_neighbours
 from engine.on_sky import lens_on_sky, orientation_document, places_on_sky, turned
+from engine.parametric.constraints import GALAXY, WIDE
 from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
 from engine.plausibility import require_hints, require_lens, unlikely
-from engine.neighbours import without_lone_pixels, without_neighbours
 from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit, undetected
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
@@ -69,8 +70,8 @@ class ImageMeasurement:
     the parametric model with the noise map times ``noise_scale``, the scatter of the residuals outside the lens in
     units of the map: a drizzled image has less noise in a pixel than its map says where the map allows for what
     neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is that of
-    :func:`~engine.status.status_of`; ``host_limit`` is what a host that is not detected is fainter than (95 %). ``inversion`` is None where none was asked for, or where it failed, which ``warnings``
-    then say.
+    :func:`~engine.status.status_of`; a host that is not detected is fainter than ``host_limit`` (95 %). ``inversion``
+    is None where none was asked for, or where it failed, which ``warnings`` then say.
     """
 
     host: Estimate
@@ -113,6 +114,11 @@ class ImageMeasurement:
             chi2 = _chi2(self.observation, self.fit, residual, self.noise_scale)
         return chi2 / self.inversion.degrees_of_freedom
 
+    @property
+    def priors(self) -> dict[str, float]:
+        """Of the lens in the parametric fit; its ellipticity is about none, or about that of Gaussians."""
+        return (GALAXY if self.fit.deflector_gaussians else WIDE).told
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form, without the arrays."""
         fit, chain = self.fit, None if self.inversion is None else self.inversion.chain.summary
@@ -140,6 +146,7 @@ class ImageMeasurement:
             "deflector": _deflector_document(fit),
             "deflector_gaussians": [asdict(one) for one in fit.deflector_gaussians],
             "arc_error": fit.arc_error,
+            "priors": self.priors,
             "decided_by_priors": list(prior_dominated(fit)),
             "background": fit.background,
             "profile": self.profile,

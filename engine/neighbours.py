@@ -93,9 +93,7 @@ def _brightest(
     return (row, column), np.asarray(blob)
 
 
-def _star(
-    observation: Observation, rest: FloatArray, noise: FloatArray, peak: tuple[int, int]
-) -> FloatArray | None:
+def _star(observation: Observation, rest: FloatArray, noise: FloatArray, peak: tuple[int, int]) -> FloatArray | None:
     """Light (ny, nx) of the star that a blob is; None where it is none."""
     scale, (ny, nx) = observation.pixel_scale, observation.shape
     rows, columns = (slice(max(0, k - _FIT_RADIUS), k + _FIT_RADIUS + 1) for k in peak)

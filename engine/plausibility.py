@@ -46,9 +46,7 @@ def require_hints(
     places = [("positions", position) for position in positions or ()]
     for name, position in (*places, *(() if centre is None else (("centre", centre),))):
         if not all(math.isfinite(value) and abs(value) <= reach for value, reach in zip(position, half, strict=True)):
-            raise SpecError(
-                name, tuple(position), f"a place on the image, within {half[0]:g} and {half[1]:g} arcsec"
-            )
+            raise SpecError(name, tuple(position), f"a place on the image, within {half[0]:g} and {half[1]:g} arcsec")
 
 
 def require_lens(observation: Observation, *, trusting: bool = False) -> tuple[str, ...]:

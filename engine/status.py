@@ -1,4 +1,4 @@
-"""What a measurement may be called: whether its host is there, its model describes the image, its answer is the data's."""
+"""What a measurement is called: whether its host is there, its model fits, and its answer is the data's."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _PRIOR_WIDTHS = {"ln_r_eff": 1.3, "n": 2.2}
 
 
 def status_of(fit: ParametricFit, host: Estimate, chi2_per_dof: float) -> MeasurementStatus:
-    """``not_detected`` before ``poor_fit`` before ``prior_dominated`` before ``ok``."""
-    if undetected(host):
-        return "not_detected"
+    """``poor_fit`` before ``not_detected`` before ``prior_dominated`` before ``ok``."""
     if chi2_per_dof > POOR_FIT:
         return "poor_fit"
+    if undetected(host):
+        return "not_detected"
     return "prior_dominated" if prior_dominated(fit) else "ok"
 
 

@@ -66,7 +66,8 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
     elif fit.deflector_gaussians:
         names.append("deflector")
         total = sum(one.flux for one in fit.deflector_gaussians)
-        images.append(sum(observation.optics.sersic_image(one) for one in fit.deflector_gaussians) / total)
+        shown = np.stack([observation.optics.sersic_image(one) for one in fit.deflector_gaussians])
+        images.append(shown.sum(axis=0) / total)
     names.append("background")
     images.append(np.ones(observation.shape))
     return tuple(names), np.stack(images)

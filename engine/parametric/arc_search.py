@@ -1,7 +1,7 @@
 """Where a lens may be whose arcs stand beside a bright galaxy: all Einstein radii are tried, with linear fits alone.
 
-For each lens and source of a lattice the chi^2 is known that a small round host takes off the image beside the deflector's
-Gaussians, amplitudes free. Rings of one radius alone would follow the brightest blob, and what a galaxy's model leaves.
+For each lens and source of a lattice the chi^2 is known that a small round host takes off the image beside the
+deflector's Gaussians, amplitudes free. Rings of one radius alone would follow the brightest blob, and what a galaxy's model leaves.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def binned(values: FloatArray, factor: int) -> FloatArray:
     """Sums (..., ny // factor, nx // factor) over squares of pixels."""
     ny, nx = (side // factor * factor for side in values.shape[-2:])
     cut = values[..., :ny, :nx]
-    return cut.reshape(*cut.shape[:-2], ny // factor, factor, nx // factor, factor).sum(axis=(-3, -1))
+    return np.asarray(cut.reshape(*cut.shape[:-2], ny // factor, factor, nx // factor, factor).sum(axis=(-3, -1)))
 
 
 class ArcSearch:

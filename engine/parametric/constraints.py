@@ -26,14 +26,25 @@ class LensPriors:
     ellipticity: float
     centre: float
 
+    @property
+    def told(self) -> dict[str, float]:
+        """By name, for a document."""
+        return {
+            "slope": self.slope[0],
+            "slope_sd": self.slope[1],
+            "shear_sd": self.shear,
+            "ellipticity_sd": self.ellipticity,
+            "centre_sd": self.centre,
+        }
+
 
 WIDE = LensPriors(slope=(2.0, 0.3), shear=0.15, ellipticity=0.25, centre=0.1)
 """Ellipticity about none; offset from the deflector's light, or from the middle of the frame where it has none."""
 GALAXY = LensPriors(slope=(2.05, 0.16), shear=0.05, ellipticity=0.1, centre=0.03)
 """Behind a galaxy that is more than one profile: ellipticity about that of its light.
 
-Arcs that no Sersic profile describes would take the lens anywhere. Elliptical lenses have a slope of 2.08 +- 0.16 (Auger
-et al. 2010), and their mass follows their light (Koopmans et al. 2006, Bolton et al. 2008).
+Arcs that no Sersic profile describes would take the lens anywhere. Elliptical lenses have a slope of 2.08 +- 0.16
+(Auger et al. 2010), and their mass follows their light (Koopmans et al. 2006, Bolton et al. 2008).
 """
 HOST_RADII = (0.5, 0.25)
 """Einstein radii from which on a host is too large to be one behind a bright galaxy, and error of its logarithm.
@@ -68,8 +79,8 @@ def constraints(
 
 def _ellipticity(space: ParameterSpace, found: FloatArray) -> FloatArray:
     if space.light is None:
-        return found / WIDE.ellipticity
-    return (found - np.array(space.light.ellipticity)) / GALAXY.ellipticity
+        return np.asarray(found / WIDE.ellipticity)
+    return np.asarray((found - np.array(space.light.ellipticity)) / GALAXY.ellipticity)
 
 
 def _centre(space: ParameterSpace, values: FloatArray) -> FloatArray:

@@ -44,12 +44,12 @@ class ParametricFit:
     ``host.flux`` and ``deflector.flux`` are the fitted fluxes [e-/s]; ``agn`` are the fitted positions and fluxes;
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, all other parameters free,
     multiplied by chi^2 per degree of freedom where that is above one. A deflector that is more than one profile is
-    ``deflector_gaussians``, and ``deflector`` is None. ``chi2`` counts the fitted pixels with ``sigma``
-    (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
-    times what is allowed for moved stamps the residuals at AGN images show, ``arc_error`` by which part of their light
-    the covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of the host
-    with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
-    of the lensed host [e-/s].
+    ``deflector_gaussians``, and ``deflector`` is None. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx), their
+    noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many times what is
+    allowed for moved stamps the residuals at AGN images show, ``arc_error`` by which part of their light the
+    covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of
+    the host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
+    all and of the lensed host [e-/s].
     """
 
     lens: PowerLawLens

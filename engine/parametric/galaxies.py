@@ -1,4 +1,4 @@
-"""The fit of a lens behind a bright real galaxy: its light by Gaussians, every Einstein radius tried, then as any fit."""
+"""The fit of a lens behind a bright real galaxy: its light by Gaussians, every Einstein radius tried, then as any."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from engine.parametric.arc_search import ArcSearch
 from engine.parametric.galaxy_light import GalaxyFit, GalaxyImages, GalaxyLight, first_light, fit_galaxy
 from engine.parametric.model import ImageModel, weights_sigma, window_round
 from engine.parametric.parameters import HOST_FLUX, KnownLight, ParameterSpace
-from engine.parametric.refine import full_fit, fitted_sigma, measured_arc_error
+from engine.parametric.refine import fitted_sigma, full_fit, measured_arc_error
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Task
 from engine.parametric.solution import Solution, minimise
@@ -108,7 +108,7 @@ def _without_deflector(solution: Solution) -> FloatArray:
     """Image (ny, nx) of AGN and arcs."""
     amplitudes, _, columns = solution.model.amplitudes(solution.values)
     chosen = [*range(solution.space.n_agn), solution.space.amplitudes + HOST_FLUX]
-    return solution.model.unwhitened(columns[:, chosen], amplitudes[chosen])
+    return np.asarray(solution.model.unwhitened(columns[:, chosen], amplitudes[chosen]))
 
 
 def galaxy_fit(task: Task, theta_E: float | None) -> Solution:
@@ -180,9 +180,7 @@ def _quick_fits(task: Task, galaxy: GalaxyFit, sigma: FloatArray, theta_E: float
 
 def _full(task: Task, solution: Solution, light: GalaxyLight, sigma: FloatArray, noise: FloatArray) -> Solution:
     """The full fit from a quick one, with Gaussians that are fitted to what its arcs leave."""
-    galaxy = fit_galaxy(
-        task.observation, task.observation.image - _without_deflector(solution), sigma, light, rounds=1
-    )
+    galaxy = fit_galaxy(task.observation, task.observation.image - _without_deflector(solution), sigma, light, rounds=1)
     known, images = _known(task, galaxy.light, galaxy.fluxes)
     space = replace(solution.space, light=known)
     old = solution.model
@@ -211,4 +209,3 @@ def _known(task: Task, light: GalaxyLight, fluxes: FloatArray) -> tuple[KnownLig
         return known, np.stack([observation.optics.sersic_image(profile) for profile in known.gaussians])
     ny, nx = observation.shape
     return known, GalaxyImages(observation, (slice(0, ny), slice(0, nx)))(light)[shining]
-

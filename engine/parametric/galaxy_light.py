@@ -1,9 +1,9 @@
-"""The light of a deflector that is no Sersic profile: concentric Gaussians, as Emsellem, Monnet & Bacon (1994) have them.
+"""The light of a deflector that is no Sersic profile: concentric Gaussians (Emsellem, Monnet & Bacon 1994).
 
 Real galaxies have cores, discs and twisted isophotes, and what one profile misses of them is brighter than an arc. Two
-families of Gaussians, each of one ellipse and of widths from the pixel to the field, leave residuals of the noise. Their
-amplitudes are linear and not negative; their centre and their two ellipses are fitted here, with what is not the galaxy's
-left out, and held in fits of the lens, which know them far less well.
+families of Gaussians, each of one ellipse and of widths from the pixel to the field, leave residuals of the noise.
+Their amplitudes are linear and not negative. Their centre and their two ellipses are fitted here, with what is not the
+galaxy's left out, and held in fits of the lens, which know them far less well.
 """
 
 from __future__ import annotations
@@ -53,9 +53,7 @@ class GalaxyLight:
     def profiles(self) -> tuple[SersicProfile, ...]:
         """The Gaussians as Sersic profiles of unit flux with n = 1/2."""
         shapes = [(width, *axis_ratio_and_angle(*ellipse)) for ellipse in self.ellipses for width in self.widths]
-        return tuple(
-            SersicProfile(1.0, _HALF_LIGHT * width, 0.5, q, phi, *self.centre) for width, q, phi in shapes
-        )
+        return tuple(SersicProfile(1.0, _HALF_LIGHT * width, 0.5, q, phi, *self.centre) for width, q, phi in shapes)
 
     def ellipticity(self, fluxes: FloatArray) -> tuple[float, float]:
         """The ellipticity (e1, e2) of the light as a whole, of those of the families by their flux."""

@@ -20,11 +20,10 @@ from engine.parametric.starts import (
     CENTRE_REACH,
     Start,
     agn_hypotheses,
-    centre_of_light,
     deflector_centre,
     filled_image,
+    off_centre,
     ring_radii,
-    shows,
     starts_from_agn,
     starts_from_arc,
 )
@@ -85,11 +84,9 @@ class Task:
             return origin
         shining = deflector_centre(self.image, scale, origin)
         if self.anywhere and self.near is None:
-            origin = centre_of_light(self.image, self.noise, scale)
-            if math.hypot(*origin) <= CENTRE_REACH:
-                origin = (0.0, 0.0)
-            elif shining is None or not shows(self.image, self.noise, scale, shining, origin):
-                shining = deflector_centre(self.image, scale, origin)
+            elsewhere = off_centre(self.image, self.noise, scale)
+            if elsewhere is not None and math.hypot(*elsewhere) > CENTRE_REACH:
+                return deflector_centre(self.image, scale, elsewhere) or elsewhere
         return origin if shining is None else shining
 
     @property

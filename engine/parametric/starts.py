@@ -19,7 +19,7 @@ from engine.parametric.point_sources import Detection
 
 CENTRE_REACH = 0.5
 """Farthest [arcsec] that the deflector is looked for from the middle of the image."""
-_CENTROID_SIGMA, _CENTROID_ROUNDS, _CENTROID_RADIUS = 3.0, 12, 1.5
+_CENTRE_SIGMA, _CENTRE_RADIUS, _CENTRE_PEAKS = 3.0, 2.0, 12
 _MOST_CANDIDATES = 6
 _CONSISTENT = 0.15
 """Misfit [arcsec] from which on positions are not the images of one source behind a power law without shear."""
@@ -98,37 +98,28 @@ def _pixel_at(image: FloatArray, pixel_scale: float, place: tuple[float, float])
     return math.floor(place[1] / pixel_scale + (ny - 1) / 2), math.floor(place[0] / pixel_scale + (nx - 1) / 2)
 
 
-def centre_of_light(image: FloatArray, noise: FloatArray, pixel_scale: float) -> tuple[float, float]:
-    """Centroid [arcsec] of what stands out of the sky, in ever smaller circles; the middle where nothing does.
+def off_centre(image: FloatArray, noise: FloatArray, pixel_scale: float) -> tuple[float, float] | None:
+    """A rough place [arcsec] of the deflector of a lens that is not in the middle; None where the light is about it.
 
-    AGN images and arcs surround their deflector, so that a lens is found which is nowhere near the middle.
+    Of the brightest peaks it is the one about which the light is most symmetric: AGN images and arcs are round their
+    deflector. The square root of the light counts, or the brightest image of an AGN would be the centre.
     """
-    y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
-    light = ndimage.gaussian_filter(image - float(np.median(image)), 1.0)
-    # The square root: the brightest image of an AGN is not to be the centre.
-    light = np.sqrt(np.where(light > _CENTROID_SIGMA * noise, np.maximum(light, 0.0), 0.0))
-    at_x, at_y, radius = 0.0, 0.0, 0.7 * max(image.shape) * pixel_scale
-    for _ in range(_CENTROID_ROUNDS):
-        inside = light * (np.hypot(x - at_x, y - at_y) < radius)
-        total = float(inside.sum())
-        if not total > 0:
-            return 0.0, 0.0
-        at_x, at_y = float((inside * x).sum()) / total, float((inside * y).sum()) / total
-        radius = max(0.75 * radius, _CENTROID_RADIUS)
-    return at_x, at_y
-
-
-def shows(
-    image: FloatArray,
-    noise: FloatArray,
-    pixel_scale: float,
-    place: tuple[float, float],
-    other: tuple[float, float],
-) -> bool:
-    """Whether at a place [arcsec] there shines more than noise, and not much less than at another."""
     smooth = ndimage.gaussian_filter(image - float(np.median(image)), 1.0)
-    here, there = (smooth[_pixel_at(image, pixel_scale, at)] for at in (place, other))
-    return bool(here > 2.0 * _CENTROID_SIGMA * float(np.median(noise)) and here > 0.2 * there)
+    root = np.sqrt(np.where(smooth > _CENTRE_SIGMA * noise, np.maximum(smooth, 0.0), 0.0))
+    y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
+    total = float(root.sum())
+    if not total > 0 or math.hypot(float((root * x).sum()), float((root * y).sum())) < CENTRE_REACH * total:
+        return None
+    reach = round(_CENTRE_RADIUS / pixel_scale)
+    padded = np.pad(root, reach)
+    peaks = np.argwhere((smooth == ndimage.maximum_filter(smooth, 3)) & (root > 0))
+    best, most = None, 0.0
+    for row, column in sorted(peaks.tolist(), key=lambda at: -smooth[at[0], at[1]])[:_CENTRE_PEAKS]:
+        around = padded[row : row + 2 * reach + 1, column : column + 2 * reach + 1]
+        symmetric = float((around * around[::-1, ::-1]).sum())
+        if symmetric > most:
+            best, most = (float(x[row, column]), float(y[row, column])), symmetric
+    return best
 
 
 def without_deflector(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> FloatArray:

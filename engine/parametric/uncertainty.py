@@ -69,10 +69,11 @@ def positive_mean(flux: float, deviation: float) -> float:
 def host_posteriors(
     solution: Solution, flux: float, covariance: FloatArray, inflation: float, fixed_index: float | None
 ) -> dict[IndexPrior, HostPosterior]:
-    """The host, its ``flux`` [e-/s] positive, with each prior of n, from a solution with the widest and its covariance, ``inflation`` included.
+    """The host with each prior of n, from a solution with the widest and its covariance, ``inflation`` included.
 
-    A maximum inside a narrower range is that range's too. One outside ends at its bound: everything else is fitted
-    again with n held there. A prior with which the host has no light is left out.
+    ``flux`` [e-/s] is its own, or a positive one that stands for it. A maximum inside a narrower range is that range's
+    too. One outside ends at its bound: everything else is fitted again with n held there. A prior with which the host
+    has no light is left out.
     """
     values, at_n = solution.values, solution.space.host_slice.start + 1
     ranges = INDEX_RANGES if fixed_index is None else {**INDEX_RANGES, "fixed": (fixed_index, fixed_index)}
