@@ -1,7 +1,8 @@
 """Where a lens may be whose arcs stand beside a bright galaxy: all Einstein radii are tried, with linear fits alone.
 
 For each lens and source of a lattice the chi^2 is known that a small round host takes off the image beside the
-deflector's Gaussians, amplitudes free. Rings of one radius alone would follow the brightest blob, and what a galaxy's model leaves.
+deflector's Gaussians, amplitudes free. Rings of one radius alone would follow the brightest blob, and what a galaxy's
+model leaves.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ _APART = 0.02
 _ARC_ROUNDS = 2
 _LEAST_FIELD = 25.0
 """Pixels."""
-_WORTH, _PART = 30.0, 0.01
+_WORTH, _PART = 10.0, 0.01
 """What a Gaussian must lower chi^2 by, and all of them together in its own units, for the galaxy to be worth a fit."""
 DESCRIBED = 1.5
 """chi^2 per pixel up to which a galaxy without AGN needs none."""
@@ -108,7 +108,7 @@ def _without_deflector(solution: Solution) -> FloatArray:
     """Image (ny, nx) of AGN and arcs."""
     amplitudes, _, columns = solution.model.amplitudes(solution.values)
     chosen = [*range(solution.space.n_agn), solution.space.amplitudes + HOST_FLUX]
-    return np.asarray(solution.model.unwhitened(columns[:, chosen], amplitudes[chosen]))
+    return solution.model.unwhitened(columns[:, chosen], amplitudes[chosen])
 
 
 def galaxy_fit(task: Task, theta_E: float | None) -> Solution:
@@ -147,7 +147,7 @@ def _searched(task: Task, theta_E: float | None) -> tuple[FloatArray, float]:
 def _arc_variance(galaxy: GalaxyFit, image: FloatArray) -> FloatArray:
     """Variance (ny, nx) of arcs that are no Sersic profile's, before any lens is known: of what the galaxy leaves."""
     rest = np.where(galaxy.others, image - galaxy.image, 0.0)
-    return (_QUICK_ARC_ERROR * np.maximum(ndimage.gaussian_filter(rest, 1.0), 0.0)) ** 2
+    return np.asarray((_QUICK_ARC_ERROR * np.maximum(ndimage.gaussian_filter(rest, 1.0), 0.0)) ** 2)
 
 
 def _quick_fits(task: Task, galaxy: GalaxyFit, sigma: FloatArray, theta_E: float | None) -> list[Solution]:
