@@ -28,7 +28,9 @@ def lone_pixels(observation: Observation) -> NDArray[np.bool_]:
     if inner.size < _EIGHT.size or np.sort(inner.ravel())[-2] < _PSF_SPREADS * psf[row, column]:
         return np.zeros(observation.shape, dtype=bool)
     image = np.where(valid, observation.image, float(np.median(observation.image[valid])))
-    above = image - ndimage.median_filter(image, footprint=_RING)
-    neighbours = ndimage.maximum_filter(np.where(valid, above, -np.inf), footprint=_EIGHT)
+    around = ndimage.median_filter(image, footprint=_RING)
+    above = image - around
+    # Above the surroundings of the pixel in question, not above their own, which it shines into.
+    neighbours = ndimage.maximum_filter(image, footprint=_EIGHT) - around
     noise = np.where(valid, observation.noise, np.inf)
     return np.asarray(valid & (above > _SIGNIFICANT * noise) & (neighbours < _ALONE * above))
