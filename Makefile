@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The constraints hold for build dependencies too, hence also as a variable.
 INSTALL := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)/python -m pip install --quiet -c constraints.txt
 
-.PHONY: help demo serve test check-long lint bench tables docs clean install install-test install-docs
+.PHONY: help demo serve kernels test check-long lint bench tables docs clean install install-test install-docs
 .DEFAULT_GOAL := help
 
 help:
@@ -59,10 +59,15 @@ lint: install-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The kernels are compiled once, and not by each process for itself. More processes than cores: tests that start services
-# wait for them most of the time. Who runs what is said in tests/conftest.py.
-test: lint
-	$(BIN)/python -c 'from service.worker import warm_up; warm_up()'
+# A small run, so that kernels are compiled once and not by each process of the tests for itself.
+kernels: install-test
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -c 'from engine import Host, Realization, run; from tests.engine.conftest import QUICK; \
+	  run(Realization("HE0435", 1.0, Host(n=2.0, r_eff=0.39, magnitude=21.0), analysis=QUICK))'
+
+# More processes than cores: tests that start services wait for them most of the time. Who runs what is said in
+# tests/conftest.py.
+test: install-test
+	$(MAKE) -j 2 lint kernels
 	$(BIN)/python -m pytest -n $$(( $$(nproc) + $$(nproc) / 2 ))
 
 # One at a time: some of them measure.
@@ -80,6 +85,7 @@ bench: install-test
 tables: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation --write docs/tables/simulation.md
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence_growth
+	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.scenes --write docs/tables/scenes.md
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.source_grid
 
 docs: install-docs

@@ -29,10 +29,10 @@ from engine.imaging.observation import Observation
 from engine.imaging.optics.stamp_matrix import blurring_matrix, central_stamp
 from engine.lensing.power_law import PowerLawLens, deflection
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
+from engine.likelihood.curvature import curvature_matrix, together
 from engine.likelihood.evidence import ln_evidence, ln_evidences
 from engine.likelihood.problem import Problem, prepare_problem
 from engine.likelihood.strength import find_strength
-from engine.likelihood.w_tilde import curvature_matrix, together
 from engine.parametric.fit import fit_parametric
 from engine.simulation.scene import build_scene
 from engine.simulation.simulate import simulate

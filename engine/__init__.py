@@ -65,6 +65,7 @@ from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 from engine.stages import STAGES
 from engine.user_files import read_camera, read_mapping, read_system
+from engine.work import Work
 
 if TYPE_CHECKING:
     from engine.acceptance import check_realization
@@ -207,6 +208,7 @@ __all__ = [
     "Trend",
     "TrendBin",
     "TrendSeries",
+    "Work",
     "analyse",
     "bias_points",
     "camera_from_mapping",

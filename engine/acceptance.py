@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 
+from engine.catalogue import resolve_camera, resolve_dither, resolve_system
 from engine.errors import SpecError
 from engine.imaging.geometry import exposure_geometry
 from engine.imaging.psf import coarsest_subpixel
 from engine.posterior.target import wide_prior
-from engine.simulation.scene import check_analysis, power_law_lens, resolve_camera, resolve_dither, resolve_system
+from engine.simulation.scene import check_analysis, power_law_lens
 from engine.spec.realization import Realization
 
 _MOST_SUBPIXELS = 8192

@@ -9,17 +9,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from astropy.stats import binom_conf_interval
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
+from engine.catalogue import resolve_system
 from engine.conventions import FloatArray
 from engine.errors import FigureError, NothingToShowError
 from engine.result import IndexPrior, Quantity, RunResult
-from engine.simulation.scene import resolve_system
 from engine.spec.analysis import EstimatorName
 from engine.spec.realization import Realization
 
@@ -206,6 +205,8 @@ class CoverageCurve:
     @property
     def interval(self) -> FloatArray:
         """Lower and upper end of Wilson's binomial 68 % interval of the share, (2, levels)."""
+        from astropy.stats import binom_conf_interval  # noqa: PLC0415 - who draws no coverage need not load it
+
         ends = binom_conf_interval(self.inside, np.full(self.inside.shape, self.count), ONE_SIGMA, interval="wilson")
         return np.asarray(ends)
 
@@ -217,7 +218,7 @@ def coverage_curve(
     levels = np.asarray(claimed, dtype=float)
     if levels.size == 0 or not np.all((levels > 0.0) & (levels < 1.0)):
         raise FigureError(f"claimed: got {list(claimed)}, allowed are probabilities between 0 and 1")
-    reach = ndtri(0.5 + 0.5 * levels)
+    reach = np.array([NormalDist().inv_cdf(0.5 + 0.5 * level) for level in levels])
     inside = (np.abs(pulls(points, quantity))[None, :] <= reach[:, None]).sum(axis=1)
     return CoverageCurve(name, levels, inside.astype(np.int64), len(points))
 

@@ -17,10 +17,15 @@ from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation
 from engine.spec.instrument import NOMINAL_OPTICS
 from engine.spec.realization import Realization
+from engine.work import Work
 
 
 def compare(
-    found: Reconstruction, realization: Realization, truth: Simulation, stages: tuple[StageTime, ...] = ()
+    found: Reconstruction,
+    realization: Realization,
+    truth: Simulation,
+    stages: tuple[StageTime, ...] = (),
+    work: Work = Work(),  # noqa: B008 - frozen
 ) -> RunResult:
     """The result of a run: what was found in the observation of a simulation, beside what was put into it.
 
@@ -33,6 +38,8 @@ def compare(
     truth : Simulation
     stages : tuple of StageTime
         Those before the analysis.
+    work : Work
+        That of these stages.
     """
     scene, inversion, products = truth.scene, found.inversion, found.products
     plane = products.source_plane
@@ -59,6 +66,7 @@ def compare(
         agn_contrast=rate_to_magnitude(agn_flux, zero_point) - truth.arc_magnitude if agn_flux > 0 else None,
         surface_brightness=mean_surface_brightness(rate_to_magnitude(scene.host.flux, zero_point), scene.host.r_eff),
         stages=(*stages, *found.stages),
+        work=work + found.work,
         warnings=(*found.warnings, *_departures(truth)),
         products=products if plane is None else replace(products, source_plane=source_beside(plane, scene.host)),
     )

@@ -114,16 +114,6 @@ def rate_to_magnitude(rate: float, zero_point: float) -> float:
     return zero_point - 2.5 * math.log10(rate)
 
 
-def paper_einstein_radius(theta_E: float, q: float, slope: float) -> float:
-    """R_E of the paper's eq. (2) from the intermediate-axis theta_E [arcsec].
-
-    Equating kappa = (2-eta)/2 (theta_E / sqrt(q x^2 + y^2/q))^eta with eq. (2), whose prefactor is
-    (2-eta)/(1+q) and whose radius is sqrt(x^2 + y^2/q^2), gives R_E = theta_E q^(-1/2) ((1+q)/2)^(1/eta).
-    """
-    eta = slope - 1.0
-    return float(theta_E * q**-0.5 * ((1.0 + q) / 2.0) ** (1.0 / eta))
-
-
 def pixel_centres(n: int, scale: float) -> FloatArray:
     """Coordinates [arcsec] of the centres of n pixels along one axis, with the origin at the middle of the axis."""
     return (np.arange(n, dtype=np.float64) - (n - 1) / 2.0) * scale

@@ -8,16 +8,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 from engine.acceptance import check_realization
+from engine.catalogue import resolve_system
 from engine.comparison import compare, view_beside
 from engine.inspection import InversionView, inspect_inversion
 from engine.reconstruction import analyse
 from engine.result import RunResult
-from engine.simulation.scene import resolve_system
 from engine.simulation.seeds import generator
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.stages import Progress, Stopwatch
+from engine.work import counted
 
 _ANALYSIS = 1
 """The purpose of the random generator of chain and draws."""
@@ -48,7 +49,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
     """
     check_realization(realization)
     watch = Stopwatch(progress)
-    with watch.stage("simulate"):
+    with watch.stage("simulate"), counted() as simulating:
         simulation = simulate_realization(realization)
     scene = simulation.scene
     found = analyse(
@@ -61,7 +62,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
         fixed_index=scene.host.n,
         progress=progress,
     )
-    return compare(found, realization, simulation, tuple(watch.stages))
+    return compare(found, realization, simulation, tuple(watch.stages), simulating.work())
 
 
 def inspect_simulation(simulation: Simulation, analysis: Analysis) -> InversionView:

@@ -31,6 +31,7 @@ from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
 from engine.status import MeasurementStatus, arc_misfit, magnitude_limit, prior_dominated, status_of
+from engine.work import Work, counted
 
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
@@ -71,7 +72,8 @@ class ImageMeasurement:
     units of the map: a drizzled image has less noise in a pixel than its map says where the map allows for what
     neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is that of
     :func:`~engine.status.status_of`; a host that is not detected is fainter than ``host_limit`` (95 %). ``inversion``
-    is None where none was asked for, or where it failed, which ``warnings`` then say.
+    is None where none was asked for, or where it failed, which ``warnings`` then say. ``work`` counts all that was
+    computed, that of an inversion that failed included.
     """
 
     host: Estimate
@@ -96,6 +98,7 @@ class ImageMeasurement:
     observation: Observation
     fit: ParametricFit
     inversion: SampledInversion | None
+    work: Work
 
     @property
     def estimator(self) -> str:
@@ -141,6 +144,7 @@ class ImageMeasurement:
             "chain": None if chain is None else asdict(chain),
             "inversion_chi2_per_dof": self.inversion_chi2_per_dof,
             "stamp_error": fit.stamp_error,
+            "model_error": _error_document(self),
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,
             "deflector": _deflector_document(fit),
@@ -152,6 +156,7 @@ class ImageMeasurement:
             "profile": self.profile,
             "seed": self.seed,
             "seconds": self.seconds,
+            "work": asdict(self.work),
             "warnings": list(self.warnings),
             "versions": self.versions,
             "engine_digest": self.engine_digest,
@@ -172,6 +177,15 @@ class ImageMeasurement:
 
 def _document(value: Quantity) -> dict[str, Any]:
     return {"mean": value.mean, "sd": value.sd, "interval95": list(value.interval95)}
+
+
+def _error_document(found: ImageMeasurement) -> dict[str, Any] | None:
+    """What the model is wrong by, as far as the image shows it; the host with a model that is taken for exact."""
+    error = found.fit.error
+    if error is None:
+        return None
+    exact = rate_to_magnitude(error.flux_without, found.observation.zero_point) if error.flux_without > 0 else None
+    return {"psf": error.psf, "host": error.host, "ln_evidence": error.gain, "magnitude_if_exact": exact}
 
 
 def _host_document(found: Estimate) -> dict[str, Any]:
@@ -199,6 +213,18 @@ def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, sc
     used = np.isfinite(fit.sigma)
     variance = fit.sigma[used] ** 2 + (scale**2 - 1.0) * observation.noise[used] ** 2
     return float(np.sum(residual[used] ** 2 / variance))
+
+
+def _of_model(fit: ParametricFit) -> list[str]:
+    """What is said of a model that is not exact."""
+    if fit.error is None:
+        return []
+    told = []
+    if fit.error.psf > 0:
+        told.append(f"psf: by the AGN images the stamp is wrong by {fit.error.psf:.0%} of its light; corrected by them")
+    if fit.error.host > 0:
+        told.append(f"host: departs from its Sersic profile by {fit.error.host:.0%} of its light")
+    return [f"{one}; the errors hold what that leaves open" for one in told]
 
 
 def _by_name(parameters: Sequence[LensParameter]) -> dict[str, Quantity]:
@@ -264,26 +290,25 @@ def measure_image(
     warnings += masked
     warnings += require_lens(observation, trusting=trust_options)
     rng = np.random.default_rng(seed)
-    found = analyse(
-        observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
-        shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, real_galaxy=True,
-        centre=centre, progress=progress,
-    )  # fmt: skip
-    cleaned, told = without_neighbours(observation, found.fit)
-    if told:
-        warnings += told
-        observation = cleaned
-        found = analyse(
-            observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
-            shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, real_galaxy=True,
-            centre=centre, progress=progress,
-        )  # fmt: skip
-    fit, orientation = found.fit, observation.orientation
-    if inversion:
-        try:
-            found = analyse(observation, analysis, rng, fit=fit, progress=progress)
-        except (PosteriorError, InversionError, ObservationError) as error:
-            warnings.append(f"inversion: {error}")
+    with counted() as tally:
+        how: dict[str, Any] = {
+            "agn_images": agn_images, "deflector": deflector, "shear": shear, "theta_E": theta_E,
+            "positions": positions, "acceptance": _ANY_LENS, "real_galaxy": True, "centre": centre,
+            "progress": progress,
+        }  # fmt: skip
+        image_alone = replace(analysis, estimators=("image",))
+        found = analyse(observation, image_alone, rng, **how)
+        cleaned, told = without_neighbours(observation, found.fit)
+        if told:
+            warnings += told
+            observation = cleaned
+            found = analyse(observation, image_alone, rng, **how)
+        fit, orientation = found.fit, observation.orientation
+        if inversion:
+            try:
+                found = analyse(observation, analysis, rng, fit=fit, progress=progress)
+            except (PosteriorError, InversionError, ObservationError) as error:
+                warnings.append(f"inversion: {error}")
     residual = observation.image - fit.model
     measured = noise_scale(observation, residual, fit.sigma, fit.lens)
     if measured is None:
@@ -302,6 +327,7 @@ def measure_image(
     warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
         warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
+    warnings += _of_model(fit)
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     status = status_of(fit, host, chi2)
     warnings += filter(None, (poor_fit(chi2), undetected(host)))
@@ -332,4 +358,5 @@ def measure_image(
         observation=observation,
         fit=fit,
         inversion=found.inversion,
+        work=tally.work(),
     )

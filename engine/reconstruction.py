@@ -41,6 +41,7 @@ from engine.result import (
 )
 from engine.spec.analysis import Analysis
 from engine.stages import Progress, Stopwatch
+from engine.work import Work, counted
 
 POOR_FIT = 1.5
 """chi^2 per degree of freedom from which on it is said that the model does not describe the image."""
@@ -75,7 +76,10 @@ class SampledInversion:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What the analysis of an observation finds; ``inversion`` is None where no estimator needed one."""
+    """What the analysis of an observation finds; ``inversion`` is None where no estimator needed one.
+
+    ``work`` is what it took.
+    """
 
     observation: Observation
     analysis: Analysis
@@ -84,6 +88,7 @@ class Reconstruction:
     inversion: SampledInversion | None
     stages: tuple[StageTime, ...]
     warnings: tuple[str, ...]
+    work: Work
 
     @property
     def lens(self) -> tuple[LensParameter, ...]:
@@ -150,7 +155,7 @@ def analyse(
     """
     watch = Stopwatch(progress)
     # One thread: a worker is given one core, and sums in a fixed order give the same bits everywhere.
-    with threadpool_limits(1):
+    with threadpool_limits(1), counted() as tally:
         if fit is None:
             with watch.stage("parametric"):
                 fit = fit_parametric(
@@ -158,6 +163,8 @@ def analyse(
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
                     real_galaxy=real_galaxy, centre=centre,
                 )  # fmt: skip
+        if fit.error is not None:
+            observation = replace(observation, psf=fit.psf)
         inversion = _sample(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:
@@ -168,7 +175,9 @@ def analyse(
             for prior in _priors(fixed_index)
             if prior in fit.hosts
         )
-    found = Reconstruction(observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings)
+    found = Reconstruction(
+        observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings, tally.work()
+    )  # fmt: skip
     told = [
         *warnings,
         *(undetected(one) for one in estimates if one.estimator == "image" and one.index_prior == "wide"),

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from engine.conventions import FloatArray
 from engine.spec.analysis import EstimatorName
+from engine.work import Work
 
 IndexPrior = Literal["wide", "free", "fixed"]
 INDEX_PRIORS: tuple[IndexPrior, ...] = get_args(IndexPrior)
@@ -194,7 +195,7 @@ class RunResult:
     ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.
     ``arc_magnitude`` is the AB magnitude of the lensed host in the image plane, ``agn_contrast`` AGN minus arc
     magnitude, ``surface_brightness`` the host's mean surface brightness inside r_eff [mag arcsec^-2] (the paper's
-    section 5).
+    section 5). ``work`` counts what simulation and analysis computed: the same for the same specification, wherever.
     """
 
     realization_digest: str
@@ -216,6 +217,7 @@ class RunResult:
     agn_contrast: float | None
     surface_brightness: float
     stages: tuple[StageTime, ...]
+    work: Work
     warnings: tuple[str, ...] = ()
     profile: str | None = None
     products: Products | None = field(default=None, repr=False, compare=False)

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import AsinhNorm, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from engine.conventions import FloatArray
-from engine.figures.sky import compass, empty_sky_noise, scale_bar, show, stretch, stretch_ticks
+from engine.figures.sky import compass, empty_sky_noise, panel_bar, scale_bar, show, stretch
 from engine.inspection import InversionView
 from engine.posterior.traces import EvidenceTrace
 from engine.result import ImagePlane, SourcePlane
@@ -34,16 +34,6 @@ _LABELS = {
 }
 
 
-def _bar(figure: Figure, axes: Axes, shown: object, label: str) -> None:
-    bar = figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.02)  # type: ignore[arg-type]
-    if isinstance(bar.norm, AsinhNorm):
-        ticks = stretch_ticks(bar.norm)
-        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-        bar.minorticks_off()
-    bar.ax.tick_params(labelsize=7)
-    bar.set_label(label, fontsize=8)
-
-
 def _images(figure: Figure, axes: list[Axes], plane: ImagePlane) -> None:
     """Data, model and normalised residual."""
     scale, rows_columns = plane.pixel_scale, np.argwhere(plane.mask)
@@ -60,7 +50,7 @@ def _images(figure: Figure, axes: list[Axes], plane: ImagePlane) -> None:
         if title == "residual":
             shown.set(cmap="RdBu_r", norm=Normalize(-_RESIDUAL_LIMIT, _RESIDUAL_LIMIT))
             panel.set_title("(data - model) / noise", fontsize=10)
-        _bar(figure, panel, shown, r"$\sigma$" if title == "residual" else _RATE)
+        panel_bar(figure, panel, shown, r"$\sigma$" if title == "residual" else _RATE)
     scale_bar(axes[0], half)
     compass(axes[0], half)
 
@@ -81,7 +71,7 @@ def _source(
     axes.set_title(title, fontsize=10)
     axes.tick_params(labelsize=7)
     axes.set_xlabel("arcsec (West)", fontsize=7)
-    _bar(figure, axes, shown, label)
+    panel_bar(figure, axes, shown, label)
 
 
 def _sources(figure: Figure, axes: list[Axes], view: InversionView) -> None:

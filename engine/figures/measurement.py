@@ -17,10 +17,10 @@ from engine.figures.sky import (
     corner_label,
     empty_sky_noise,
     name_points,
+    panel_bar,
     scale_bar,
     show,
     stretch,
-    stretch_ticks,
 )
 from engine.light.sersic import surface_brightness
 from engine.measure import ImageMeasurement
@@ -31,16 +31,6 @@ _HOST_PIXELS = 200
 _FIELD_RADII = 3.0
 _DATA_UNIT = "e$^-$ s$^{-1}$ per pixel, asinh"
 _SOURCE_UNIT = "e$^-$ s$^{-1}$ arcsec$^{-2}$, asinh"
-
-
-def _bar(figure: Figure, axes: Axes, shown: object, label: str) -> None:
-    bar = figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.02)  # type: ignore[arg-type]
-    if isinstance(bar.norm, AsinhNorm):
-        ticks = stretch_ticks(bar.norm)
-        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
-        bar.minorticks_off()
-    bar.ax.tick_params(labelsize=7)
-    bar.set_label(label, fontsize=8)
 
 
 def _sky(axes: Axes, image: FloatArray, scale: float, norm: AsinhNorm, half: float, title: str) -> AxesImage:
@@ -58,7 +48,7 @@ def _host_panel(figure: Figure, axes: Axes, found: ImageMeasurement, half: float
     axes.set_title("host behind the lens: Sersic fit", fontsize=10)
     axes.tick_params(labelsize=7)
     corner_label(axes, f"n {host.n:.2f}, R {host.r_eff:.3f}″")
-    _bar(figure, axes, shown, _SOURCE_UNIT)
+    panel_bar(figure, axes, shown, _SOURCE_UNIT)
 
 
 def _source_panel(figure: Figure, axes: Axes, found: ImageMeasurement, half: float, norm: AsinhNorm) -> None:
@@ -76,7 +66,7 @@ def _source_panel(figure: Figure, axes: Axes, found: ImageMeasurement, half: flo
     axes.set_facecolor("black")
     axes.tick_params(labelsize=7)
     axes.set_title("host behind the lens: inversion", fontsize=10)
-    _bar(figure, axes, shown, _SOURCE_UNIT)
+    panel_bar(figure, axes, shown, _SOURCE_UNIT)
 
 
 def measurement_figure(found: ImageMeasurement) -> Figure:
@@ -90,12 +80,12 @@ def measurement_figure(found: ImageMeasurement) -> Figure:
     figure = Figure(figsize=(12.4, 7.9), layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
     axes = figure.subplots(2, 3)
     shown = _sky(axes[0, 0], image, scale, norm, half, "image (grey: not used)")
-    _bar(figure, axes[0, 0], shown, _DATA_UNIT)
+    panel_bar(figure, axes[0, 0], shown, _DATA_UNIT)
     name_points(axes[0, 0], [(str(k + 1), agn.x, agn.y) for k, agn in enumerate(fit.agn)], half)
     scale_bar(axes[0, 0], half)
     compass(axes[0, 0], half, orientation=observation.orientation)
     shown = _sky(axes[0, 1], fit.model, scale, norm, half, "parametric model")
-    _bar(figure, axes[0, 1], shown, _DATA_UNIT)
+    panel_bar(figure, axes[0, 1], shown, _DATA_UNIT)
     used = np.isfinite(fit.sigma)
     variance = np.where(used, fit.sigma, 1.0) ** 2
     variance += np.where(used, (found.noise_scale**2 - 1.0) * observation.noise**2, 0.0)
@@ -107,13 +97,13 @@ def measurement_figure(found: ImageMeasurement) -> Figure:
     panel.set(xlim=(-half, half), ylim=(-half, half), xticks=[], yticks=[], facecolor="0.6")
     panel.set_title("residual", fontsize=10)
     corner_label(panel, f"chi$^2$/dof {found.chi2_per_dof:.2f}")
-    _bar(figure, panel, drawn, "sigma, error of the PSF included")
+    panel_bar(figure, panel, drawn, "sigma, error of the PSF included")
     arc = np.where(valid, image - fit.model + fit.arc, np.nan)
     inner = np.where(used, fit.arc, 0.0)
     shown = _sky(
         axes[1, 0], arc, scale, stretch(sky, 1.3 * float(inner.max())), half, "image less AGN, deflector, background"
     )
-    _bar(figure, axes[1, 0], shown, _DATA_UNIT)
+    panel_bar(figure, axes[1, 0], shown, _DATA_UNIT)
     reach = min(_HOST_RADII * fit.host.r_eff, 1.2 * fit.lens.theta_E)
     peak = float(surface_brightness(fit.host, np.array(fit.host.x + 0.1 * fit.host.r_eff), np.array(fit.host.y)))
     bright = AsinhNorm(linear_width=0.01 * peak, vmin=0.0, vmax=peak)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from engine.catalogue import resolve_system
 from engine.conventions import FloatArray
 from engine.figures.sky import (
     colour_bar,
@@ -22,7 +23,6 @@ from engine.figures.sky import (
 )
 from engine.grid import GridRun
 from engine.imaging.observation import Observation
-from engine.simulation.scene import resolve_system
 from engine.simulation.simulate import Simulation
 
 # Panels this small show arcs, not the sky.

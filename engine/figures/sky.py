@@ -52,6 +52,17 @@ def colour_bar(figure: Figure, shown: AxesImage, axes: list[Axes], norm: AsinhNo
     bar.set_label(label, fontsize=9)
 
 
+def panel_bar(figure: Figure, axes: Axes, shown: object, label: str) -> None:
+    """A colour bar of one panel."""
+    bar = figure.colorbar(shown, ax=axes, fraction=0.046, pad=0.02)  # type: ignore[arg-type]
+    if isinstance(bar.norm, AsinhNorm):
+        ticks = stretch_ticks(bar.norm)
+        bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
+        bar.minorticks_off()
+    bar.ax.tick_params(labelsize=7)
+    bar.set_label(label, fontsize=8)
+
+
 def scale_bar(axes: Axes, half_width: float, *, fontsize: float = 8.0) -> None:
     """A bar of 1, 2 or 5 arcsec times a power of ten, about a fifth of the field long, at the lower left."""
     target = 0.4 * half_width

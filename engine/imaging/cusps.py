@@ -9,12 +9,14 @@ band-limited, its convolution with what results is that with the light itself.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
 
 from engine.conventions import FloatArray
 from engine.imaging.geometry import Geometry
+from engine.lensing.lens_equation import makes_ring, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
@@ -23,8 +25,21 @@ _FINE = 5
 """Cells along a sub-pixel."""
 _HALF = 12
 """Radius round a cusp within which light is moved [sub-pixels]: beyond it the light is smooth on their scale."""
+_ON_RING = 10
+"""Distance of points on a ring [sub-pixels]: between two of them more than eight tenths of its light are moved."""
 _NODES = 8
 """Sub-pixels along each axis among which a cell's light is divided: Lagrange interpolation of order 7."""
+
+
+def cusp_positions(profile: SersicProfile, lens: PowerLawLens | None, geometry: Geometry) -> list[tuple[float, float]]:
+    """Where the cusp of a profile is seen [arcsec]; of a ring, points that lie within each other's reach."""
+    if lens is None:
+        return [(profile.x, profile.y)]
+    if not makes_ring(lens, profile.x, profile.y):
+        return [(image.x, image.y) for image in solve_lens_equation(lens, profile.x, profile.y)]
+    number = math.ceil(2.0 * math.pi * lens.theta_E / (_ON_RING * geometry.subpixel_scale))
+    angles = 2.0 * math.pi / number * np.arange(number)
+    return [(lens.x + lens.theta_E * math.cos(t), lens.y + lens.theta_E * math.sin(t)) for t in angles]
 
 
 def place_cusps(

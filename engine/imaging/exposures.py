@@ -38,7 +38,9 @@ def expose(image: FloatArray, geometry: Geometry, detector_kernel: FloatArray) -
         # One native pixel more on each side: its charge or signal leaks in, and the margin has room for it.
         row, column = geometry.margin + shift_y - factor, geometry.margin + shift_x - factor
         window = image[row : row + (ny + 2) * factor, column : column + (nx + 2) * factor]
-        binned = window.reshape(ny + 2, factor, nx + 2, factor).sum(axis=(1, 3))
+        # Added up slice by slice: sums over axes as short as these take numpy three times as long.
+        rows = np.sum([window[k::factor] for k in range(factor)], axis=0)
+        binned = np.sum([rows[:, k::factor] for k in range(factor)], axis=0)
         for (j, i), weight in np.ndenumerate(detector_kernel):
             if weight != 0:
                 # A kernel element at offset (+1, +1) brings light from the pixel at (-1, -1).

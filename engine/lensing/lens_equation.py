@@ -38,6 +38,8 @@ _ROOT = 1e-12
 """What may be left of the lens equation [arcsec] at an image: some thousand roundings."""
 _MOST_IMAGES = 16
 _MOST_CELLS = 20_000
+_RING = 1e-6
+"""How far a lens may be from round, and a source from its middle in theta_E, whose image passes for a ring."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,12 @@ def _images(
                 roots[n, 0], roots[n, 1] = x, y
                 n += 1
     return n
+
+
+def makes_ring(lens: PowerLawLens, source_x: float, source_y: float) -> bool:
+    """Whether a point is seen as a ring, of radius theta_E round the lens: behind the middle of one that is round."""
+    near = math.hypot(source_x - lens.x, source_y - lens.y) <= _RING * lens.theta_E
+    return near and lens.q >= 1.0 - _RING and math.hypot(lens.gamma1, lens.gamma2) <= _RING
 
 
 def solve_lens_equation(

@@ -21,6 +21,7 @@ from engine.light.radial_table import look_up_derivatives, tabulate
 from engine.light.refinement import NODES, WEIGHTS, Leaves
 from engine.light.rendering import HALO, axis_with_halo
 from engine.light.sersic import SHAPE, SersicProfile, shape_of
+from engine.work import count
 
 _SHEAR_DERIVATIVES = 2
 _INDEX_STEP = 1e-4
@@ -150,17 +151,21 @@ class LightDerivatives:
             _seen_directly(x, y, self._shape, self._table, self._by_n, out)
         else:
             _seen_through_lens(x, y, self._shape, self._lens, self._table, self._by_n, out)
+            count("rays_traced", x.size)
         return out
 
     def sampled(self, x: FloatArray, y: FloatArray, side: float) -> FloatArray:
         """Derivatives (size, ny, nx) of :func:`engine.light.rendering.sample_sersic`."""
-        return self.at(np.tile(x, y.size), np.repeat(y, x.size)).reshape(self.size, y.size, x.size) * side**2
+        out = self.at(np.tile(x, y.size), np.repeat(y, x.size)).reshape(self.size, y.size, x.size) * side**2
+        count("pixels_rendered", out.size)
+        return out
 
     def integrated(self, x: FloatArray, y: FloatArray, side: float, leaves: Leaves) -> FloatArray:
         """Derivatives (size, ny, nx) of a rendering whose refined pixels were cut into ``leaves``."""
         columns, rows = axis_with_halo(x, side, "x"), axis_with_halo(y, side, "y")
         rays = self.at(np.tile(columns, rows.size), np.repeat(rows, columns.size))
         out = np.empty((self.size, y.size, x.size))
+        count("pixels_rendered", out.size)
         _mean_over_pixels(rays.reshape(self.size, rows.size, columns.size), side, out)
         flat = out.reshape(self.size, -1)
         flat[:, leaves.owner] = 0.0

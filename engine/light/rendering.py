@@ -22,6 +22,7 @@ from engine.light.brightness_bounds import brightness_range, length
 from engine.light.radial_table import brightness, tabulate, to_profile_axes
 from engine.light.refinement import Leaves, Tracer, joined, refine_pixels
 from engine.light.sersic import SersicProfile, sersic_constants
+from engine.work import count
 
 DEFAULT_TOLERANCE = 1e-4
 """Estimated error of a pixel as a fraction of the brightest, and of all pixels together as a fraction of the flux."""
@@ -46,6 +47,7 @@ def _tracer(profile: SersicProfile, lens: PowerLawLens | None) -> Tracer:
     def trace(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         bx, by = np.empty(x.size), np.empty(x.size)
         trace_rays(x, y, constants, bx, by)
+        count("rays_traced", x.size)
         return to_profile_axes(bx, by, light)
 
     return trace
@@ -198,6 +200,7 @@ def rendered(
     x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     trace, table = _tracer(profile, lens), tabulate(profile)
     image, error = _first_pass(x, y, pixel_scale, trace, table)
+    count("pixels_rendered", image.size)
     parts: list[Leaves] = []
 
     def refine(chosen: NDArray[np.intp], absolute: float, relative: float) -> None:
@@ -234,4 +237,5 @@ def sample_sersic(
     """
     u, v = _tracer(profile, lens)(np.tile(x, y.size), np.repeat(y, x.size))
     rays = brightness(u, v, tabulate(profile)).reshape(y.size, x.size)
+    count("pixels_rendered", rays.size)
     return np.asarray(rays * (profile.flux * side**2))

@@ -18,6 +18,7 @@ from engine.errors import InversionError
 from engine.likelihood.noise import NoiseFactor, factorise_noise
 from engine.likelihood.w_tilde import WTilde, compute_w_tilde
 from engine.source.lensing_matrix import RayBundle
+from engine.work import count
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,7 @@ def marginalise_amplitudes(
     noise = factorise_noise(linear.covariance)
     white_d = noise.whiten(linear.data)
     k = linear.columns.shape[1]
+    count("columns_solved", k)
     white_u = noise.whiten(linear.columns)
     ln_u, ln_l = 0.0, 2.0 * float(np.log(priors.max(axis=1, initial=0.0)).sum())
     projected_d = white_d

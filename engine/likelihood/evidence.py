@@ -13,10 +13,11 @@ from engine.conventions import FloatArray
 from engine.errors import InversionError
 from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
-from engine.likelihood.w_tilde import curvature_matrices, curvature_matrix, together, workspace
+from engine.likelihood.curvature import curvature_matrices, curvature_matrix, together, workspace
 from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, map_rays
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant
+from engine.work import count
 
 MAX_CONDITION = 1e14
 """Beyond this the solution has lost all but two digits."""
@@ -97,6 +98,7 @@ def _solve(
 ) -> _Solved:
     """Factorise A = F + lambda H and solve; ``f`` (Fortran order, valid in its lower triangle) is overwritten."""
     d = lensing.transpose(likelihood.wd)
+    count("columns_solved", d.size)
     add_regularisation(f, model, _strength(ln_lambda))
     factor, info = lapack.dpotrf(f, lower=1, clean=0, overwrite_a=1)
     if info != 0:
@@ -145,8 +147,9 @@ def ln_evidences(
 ) -> list[float | InversionError]:
     """Ln Z of the data given each lens and its ln lambda; where it cannot be had the error that says why.
 
-    As many as fit the cache share what it costs to fetch W from memory (:func:`~.w_tilde.together`).
+    As many as fit the cache share what it costs to fetch W from memory (:func:`~.curvature.together`).
     """
+    count("evidence_evaluations", len(lenses))
     n = model.shape[0] * model.shape[1]
     found: list[float | InversionError] = []
     size = together(n)

@@ -46,6 +46,14 @@ class NoiseFactor:
             out[offset:] += band[: out.size - offset] ** 2
         return out
 
+    def rows(self) -> FloatArray:
+        """R by its rows (M, bandwidth + 1): the last one is the diagonal, zeros stand before the first column."""
+        width, m = self.bands.shape
+        out = np.zeros((m, width))
+        for offset, band in enumerate(self.bands):
+            out[offset:, width - 1 - offset] = band[: m - offset]
+        return out
+
     def _solve(self, values: FloatArray, *, transposed: bool) -> FloatArray:
         if self.bands.shape[0] == 1:
             deviations = self.bands[0]

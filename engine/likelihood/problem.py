@@ -13,7 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import ObservationError
 from engine.imaging.observation import Observation
-from engine.lensing.lens_equation import solve_lens_equation
+from engine.lensing.lens_equation import makes_ring, solve_lens_equation
 from engine.lensing.power_law import source_position
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
 from engine.parametric.fit import ParametricFit
@@ -62,7 +62,7 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
         images.append(observation.point_source(agn.x, agn.y))
     if fit.deflector is not None:
         names.append("deflector")
-        images.append(observation.optics.sersic_image(fit.deflector) / fit.deflector.flux)
+        images.append(observation.optics.sersic_image(replace(fit.deflector, flux=1.0)))
     elif fit.deflector_gaussians:
         names.append("deflector")
         total = sum(one.flux for one in fit.deflector_gaussians)
@@ -124,6 +124,14 @@ def _defect(
     return np.asarray(exact - blurring @ rays.of_envelope())
 
 
+def _brightest_image(fit: ParametricFit) -> tuple[float, float]:
+    """An image position [arcsec] that maps to the host's centre: of its images the brightest, of a ring any point."""
+    if makes_ring(fit.lens, fit.host.x, fit.host.y):
+        return fit.lens.x + fit.lens.theta_E, fit.lens.y
+    image = solve_lens_equation(fit.lens, fit.host.x, fit.host.y)[0]
+    return image.x, image.y
+
+
 def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Analysis) -> Problem:
     """Lay out the linear problem.
 
@@ -161,8 +169,7 @@ def prepare_problem(observation: Observation, fit: ParametricFit, analysis: Anal
         rays = replace(rays, envelope=_envelope(fit, rays))
         defect = _defect(observation, mask, rays, blurring)
         blurring = sparse.hstack([blurring, defect[:, None]], format="csr")
-        image = max(solve_lens_equation(fit.lens, fit.host.x, fit.host.y), key=lambda found: abs(found.magnification))
-        rays = replace(rays, centre=(image.x, image.y))
+        rays = replace(rays, centre=_brightest_image(fit))
     linear = LinearData(
         data=observation.image[mask],
         covariance=_noise(observation, fit, analysis, mask, core),

@@ -20,6 +20,7 @@ from engine.lensing.power_law import PowerLawLens
 from engine.likelihood.amplitudes import MarginalLikelihood
 from engine.likelihood.evidence import MAX_CONDITION, least_condition, normal_equations
 from engine.source.regularisation import SourceModel, add_regularisation, sparse_regularisation
+from engine.work import count
 
 LOWEST, HIGHEST = -80.0, 80.0
 """Interval of ln lambda that is searched where none is given."""
@@ -49,6 +50,8 @@ class _Slope:
     def __call__(self, ln_lambda: float) -> float:
         """Positive where the evidence rises; infinite where A cannot be trusted in float64 and needs more of lambda."""
         self.factorisations += 1
+        count("evidence_evaluations", 1)
+        count("columns_solved", self.d.size)
         a = self.f.copy(order="F")
         add_regularisation(a, self.model, math.exp(ln_lambda))
         factor, info = lapack.dpotrf(a, lower=1, clean=0, overwrite_a=1)

@@ -27,6 +27,7 @@ from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
+from engine.parametric.shared_error import ModelError
 from engine.parametric.solution import Solution
 from engine.parametric.uncertainty import host_posteriors, parameter_covariance, positive_mean
 from engine.result import IndexPrior
@@ -49,7 +50,8 @@ class ParametricFit:
     allowed for moved stamps the residuals at AGN images show, ``arc_error`` by which part of their light the
     covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of
     the host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
-    all and of the lensed host [e-/s].
+    all and of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how
+    much, or is None, and ``psf`` (n, n) is the stamp with its correction.
     """
 
     lens: PowerLawLens
@@ -69,6 +71,8 @@ class ParametricFit:
     model: FloatArray
     arc: FloatArray
     sigma: FloatArray
+    psf: FloatArray
+    error: ModelError | None
 
     @property
     def misfit(self) -> float:
@@ -151,8 +155,9 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     """A solution as it is handed on; a PosteriorError where it is no good."""
     model, values, space = solution.model, solution.values, solution.space
     jacobian, amplitudes = model.full_jacobian(values)
-    _, rest, _ = model.amplitudes(values)
-    covered, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes
+    host_departs, unmodelled, rest = model.explained(values)
+    freedom = model.pixels - space.size - space.amplitudes - round(model.shared_parameters)
+    covered = float(rest @ rest)
     chi2 = covered if solution.noise is None else _chi2_of(solution, rest, solution.noise)
     flux = float(amplitudes[HOST_FLUX])
     if not flux > 0 and not (task.dark_host and space.n_agn):
@@ -172,9 +177,9 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     if not flux > 0:
         flux = positive_mean(flux, math.sqrt(float(covariance[HOST_FLUX, HOST_FLUX])))
     hosts = host_posteriors(solution, flux, covariance, inflation, fixed_index)
-    shape = task.observation.shape
+    shape = model.observation.shape
     shown = ImageModel(
-        task.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True, galaxy=model.galaxy
+        model.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True, galaxy=model.galaxy
     )
     columns = shown.columns(values)
     deflector = profile_of(values[space.deflector_slice], float(amplitudes[space.n_agn])) if space.deflector else None
@@ -193,9 +198,11 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         stamp_error=solution.stamp_error,
         arc_error=solution.arc_error,
         at_bound=solution.at_bound,
-        model=(columns @ amplitudes).reshape(shape),
-        arc=(columns[:, HOST_FLUX] * flux).reshape(shape),
+        model=(columns @ amplitudes).reshape(shape) + unmodelled,
+        arc=(columns[:, HOST_FLUX] * flux).reshape(shape) + host_departs,
         sigma=model.sigma if solution.noise is None else solution.noise,
+        psf=model.observation.psf,
+        error=solution.error,
     )
 
 

@@ -56,7 +56,7 @@ def asks_for_galaxy(solution: Solution) -> bool:
     scale = model.observation.pixel_scale
     light = first_light((x, y), max(_LEAST_FIELD * scale, _FIELD_RADII * solution.lens.theta_E), scale, (e1, e2))
     images = GalaxyImages(model.observation, model.window)(light).reshape(light.size, -1)
-    more = (images * model.weight).T
+    more = model.decorrelated((images * model.weight).T)
     more = more - basis @ (basis.T @ more)
     basis, _ = np.linalg.qr(more)
     gain = float(np.sum((basis.T @ rest) ** 2))
@@ -101,7 +101,7 @@ def _behind_galaxy(task: Task, first: Solution, theta_E: float | None) -> Soluti
         galaxy=images,
     )  # fmt: skip
     low, high = space.bounds(values, task.observation.pixel_scale, task.priors)
-    return _with_arc_error(task, replace(first, model=model, values=values, low=low, high=high))
+    return _with_arc_error(task, replace(first, model=model, values=values, low=low, high=high, error=None))
 
 
 def _without_deflector(solution: Solution) -> FloatArray:

@@ -29,7 +29,9 @@ from engine.light.sersic import SHAPE, SersicProfile, profile_of
 from engine.parametric.constraints import constraints
 from engine.parametric.galaxy_light import non_negative
 from engine.parametric.parameters import HOST_FLUX, ParameterSpace, lens_of
+from engine.parametric.shared_error import SharedError
 from engine.spec.priors import LensParameterName, ParameterPrior
+from engine.work import count
 
 RENDER_TOLERANCE = 1e-3
 _ANCHOR = 5e-4
@@ -58,6 +60,8 @@ class ImageModel:
         What is known of lens parameters, by name; each replaces the prior that holds otherwise.
     galaxy : array (gaussians, ny, nx), optional
         Images of unit flux of the Gaussians that the deflector's light is made of, where the space has any.
+    shared : SharedError, optional
+        Errors [e-/s] that pixels of the window share, as that of the PSF: their amplitudes are marginalised.
     """
 
     def __init__(
@@ -71,6 +75,7 @@ class ImageModel:
         exact: bool,
         priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
         galaxy: FloatArray | None = None,
+        shared: SharedError | None = None,
     ) -> None:
         self.galaxy = galaxy
         self.observation, self.space, self.window = observation, space, window
@@ -87,8 +92,12 @@ class ImageModel:
         inside = sigma[window]
         self.weight = np.where(np.isfinite(inside), 1.0 / inside, 0.0).ravel()
         image = np.where(observation.valid, observation.image, 0.0)[window]
-        self._observed = image.ravel() * self.weight
-        self.data = self._observed
+        observed = image.ravel() * self.weight
+        self.shared = shared
+        self._shared = None if shared is None else shared.whitened(self.weight)
+        self._observed = observed if self._shared is None else observed + self._shared.offset
+        self._target = self._observed
+        self.data = self.decorrelated(self._target)
         self.pixels = int(np.count_nonzero(self.weight))
         inner = np.zeros((0, 1)) if galaxy is None else galaxy[:, window[0], window[1]].reshape(len(galaxy), -1)
         self._galaxy = inner * self.weight
@@ -178,7 +187,8 @@ class ImageModel:
             exact = self.observation.optics.sersic_image(profile, behind)[self.window]
             defect += brightness * (exact.ravel() * self.weight - column)
         out = copy(self)
-        out.data = self._observed - defect
+        out._target = self._observed - defect
+        out.data = self.decorrelated(out._target)
         out._anchors = {}
         return out
 
@@ -194,15 +204,17 @@ class ImageModel:
         return np.stack(out, axis=1)
 
     def amplitudes(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Best amplitudes, whitened residuals, and the columns."""
+        """Best amplitudes, whitened residuals without what shared errors explain, and the columns with it."""
         columns = self.columns(values)
-        size = np.sqrt((columns**2).sum(axis=0))
+        seen = self.decorrelated(columns)
+        size = np.sqrt((seen**2).sum(axis=0))
         if not (size > 0).all():
             raise PosteriorError("parametric model: a component puts no light on the image")
+        count("columns_solved", size.size)
         if self.space.gaussians:
-            best = non_negative(columns, self.data, ~self._gaussian)
-            return best, self.data - columns @ best, columns
-        scaled = columns / size
+            best = non_negative(seen, self.data, ~self._gaussian)
+            return best, self.data - seen @ best, columns
+        scaled = seen / size
         best = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ self.data, rcond=1e-12)[0]
         return best / size, self.data - scaled @ best, columns
 
@@ -211,6 +223,43 @@ class ImageModel:
         """Which amplitudes are those of Gaussians."""
         place = np.arange(self.space.amplitudes) - self.space.n_agn
         return (place >= 0) & (place < self.space.gaussians)
+
+    def decorrelated(self, values: FloatArray) -> FloatArray:
+        """Whitened values (pixels, ...) with the errors that pixels share taken into account."""
+        return values if self._shared is None else self._shared.decorrelated(values)
+
+    @property
+    def host_blur(self) -> StampBlur:
+        """What carries rays of the host to the window."""
+        return self._inner
+
+    @property
+    def shared_parameters(self) -> float:
+        """How many amplitudes of shared errors the pixels determine."""
+        return 0.0 if self._shared is None else self._shared.effective_parameters
+
+    def image(self, values: FloatArray, amplitudes: FloatArray) -> FloatArray:
+        """The model's window [e-/s], shape (rows, columns), without shared errors; zero where pixels do not count."""
+        rendered = self.columns(values) @ amplitudes
+        flat = np.divide(rendered, self.weight, out=np.zeros_like(rendered), where=self.weight > 0)
+        return flat.reshape(self.shape)
+
+    def explained(self, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What shared errors add to the model [e-/s], and what neither explains.
+
+        The first two have the window's shape, what the host's errors add and what all of them do; the last are whitened
+        residuals (pixels,).
+        """
+        amplitudes, rest, columns = self.amplitudes(values)
+        if self.shared is None or self._shared is None:
+            return np.zeros(self.shape), np.zeros(self.shape), rest
+        without = self._target - columns @ amplitudes
+        found = self._shared.amplitudes(without)
+        # What the mean amplitudes do is in the stamp of the observation already.
+        added, of_host = found - self.shared.mean, self.shared.of_host
+        host = self.shared.columns[:, :of_host] @ added[:of_host]
+        rest = without - self._shared.columns @ found
+        return host.reshape(self.shape), (self.shared.columns @ added).reshape(self.shape), rest
 
     def unwhitened(self, columns: FloatArray, amplitudes: FloatArray) -> FloatArray:
         """Image (ny, nx) [e-/s] of some of the whitened columns; zero where pixels do not count and off the window."""
@@ -229,9 +278,9 @@ class ImageModel:
         At values whose light has been rendered nothing is rendered again.
         """
         best, _, columns = self.amplitudes(values)
-        moved = self._column_derivatives(values, best)
+        moved = self.decorrelated(self._column_derivatives(values, best))
         # Gaussians that do not shine stay dark in a small step.
-        basis, _ = np.linalg.qr(columns[:, ~self._gaussian | (best > 0)])
+        basis, _ = np.linalg.qr(self.decorrelated(columns[:, ~self._gaussian | (best > 0)]))
         moved -= basis @ (basis.T @ moved)
         return np.concatenate([-moved, _differences(lambda v: constraints(self.space, v, self.priors), values, 1e-6)])
 
@@ -240,7 +289,7 @@ class ImageModel:
         best, _, columns = self.amplitudes(values)
         rows = _differences(lambda v: constraints(self.space, v, self.priors), values, 1e-6)
         shining = columns * (~self._gaussian | (best > 0))
-        top = np.concatenate([self._column_derivatives(values, best), shining], axis=1)
+        top = self.decorrelated(np.concatenate([self._column_derivatives(values, best), shining], axis=1))
         below = np.concatenate([-rows, np.zeros((rows.shape[0], best.size))], axis=1)
         return np.concatenate([top, below]), best
 

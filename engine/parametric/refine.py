@@ -13,15 +13,19 @@ from numpy.typing import NDArray
 from engine.conventions import FloatArray, pixel_centres
 from engine.lensing.power_law import PowerLawLens
 from engine.parametric.model import ImageModel, weights_sigma
+from engine.parametric.model_error import learned
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.residual_noise import measured_stamp_error, noise_scale
 from engine.parametric.search import Task, agn_light
+from engine.parametric.shared_error import SharedError
 from engine.parametric.solution import NEAR_STEPS, TOLERANCE, Solution, minimise
 from engine.parametric.uncertainty import parameter_covariance
 
 SUBRAYS = 2
 _STEPS = 40
+_ROUNDS = 3
+"""Fits with errors of the model: each learns from the one before."""
 _SHEAR_SHOWS = 4.0
 """Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
 
@@ -67,8 +71,11 @@ def polished(task: Task, solution: Solution) -> Solution:
     if error is not None and error != best.stamp_error:
         best = replace(best, stamp_error=error)
         best = full_fit(task, best, fitted_sigma(task, best), shear=task.may_shear)
+    if task.observation.optics.misfit_is_noise:
+        best = _with_model_error(task, best)
+        task = replace(task, observation=best.model.observation)
     if task.shear is None and not _shear_shows(best):
-        best = full_fit(task, best, best.model.sigma, shear=False)
+        best = full_fit(task, best, best.model.sigma, shear=False, shared=best.model.shared)
     for _ in range(task.observation.optics.correction_rounds):
         best = minimise(
             best.model.corrected(best.values), best.start, best.values, NEAR_STEPS, TOLERANCE,
@@ -77,17 +84,45 @@ def polished(task: Task, solution: Solution) -> Solution:
     return best
 
 
-def full_fit(task: Task, solution: Solution, sigma: FloatArray, *, shear: bool) -> Solution:
+def _with_model_error(task: Task, solution: Solution) -> Solution:
+    """The fit with the errors of the model that it shows marginalised, and the stamp corrected."""
+    given, known = task.observation.psf, solution.error
+    for _ in range(_ROUNDS):
+        stamps, extended = _variances(task, solution)
+        base = weights_sigma(task.observation, extended + _noise_excess(task, solution))
+        found = learned(solution, given, known, base, stamps, _fitted(task, solution.lens, solution.agn()))
+        if found is None:
+            break
+        known = found.error
+        task = replace(task, observation=replace(task.observation, psf=given + known.correction))
+        solution = replace(solution, stamp_error=found.left, error=known)
+        solution = full_fit(task, solution, fitted_sigma(task, solution), shear=task.may_shear, shared=found.shared)
+    return solution
+
+
+def _noise_excess(task: Task, solution: Solution) -> FloatArray:
+    """Variance (ny, nx) that the noise map lacks by the scatter outside the lens: it is no error of the model."""
+    model, observation = solution.model, task.observation
+    amplitudes, _, _ = model.amplitudes(solution.values)
+    residual = observation.image - model.image(solution.values, amplitudes)
+    scale = noise_scale(observation, residual, model.sigma, solution.lens) or 1.0
+    return np.asarray((max(1.0, scale) ** 2 - 1.0) * np.where(observation.valid, observation.noise, 0.0) ** 2)
+
+
+def full_fit(
+    task: Task, solution: Solution, sigma: FloatArray, *, shear: bool, shared: SharedError | None = None
+) -> Solution:
     """The fit of the whole image that begins where another ended."""
     ny, nx = task.observation.shape
     space: ParameterSpace = replace(solution.space, shear=shear)
     whole = slice(0, ny), slice(0, nx)
     model = ImageModel(
-        task.observation, space, sigma, whole, subrays=SUBRAYS, exact=True, priors=task.priors,
+        task.observation, space, sigma, whole, subrays=SUBRAYS, exact=True, priors=task.priors, shared=shared,
         galaxy=solution.model.galaxy,
     )  # fmt: skip
     values = solution.space.with_shear(solution.values, shear=shear)
-    return minimise(model, solution.start, values, _STEPS, TOLERANCE, stamp_error=solution.stamp_error)
+    found = minimise(model, solution.start, values, _STEPS, TOLERANCE, stamp_error=solution.stamp_error)
+    return replace(found, error=solution.error)
 
 
 def _variances(task: Task, solution: Solution) -> tuple[FloatArray, FloatArray]:

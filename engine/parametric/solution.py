@@ -13,6 +13,7 @@ from engine.lensing.power_law import PowerLawLens
 from engine.parametric.model import ImageModel
 from engine.parametric.parameters import HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
+from engine.parametric.shared_error import ModelError
 from engine.parametric.starts import Start
 
 TOLERANCE = 1e-6
@@ -28,8 +29,9 @@ class Solution:
     """A minimum between bounds: the model it belongs to, its parameters, bounds and cost (chi^2 and priors).
 
     ``start`` is where the search for it began; ``stamp_error`` is the error of the light of AGN images that its noise
-    map holds, in units of what the optics allow for. ``noise`` (ny, nx) is the model's without the error of the arcs,
-    where that has one, ``arc_error`` that part of their light: no host is a Sersic profile.
+    map holds, in units of what the optics allow for; ``error`` are the errors of the model that it marginalises.
+    ``noise`` (ny, nx) is the model's without the error of the arcs, where that has one, ``arc_error`` that part of
+    their light: no host is a Sersic profile.
     """
 
     model: ImageModel
@@ -41,6 +43,7 @@ class Solution:
     stamp_error: float = 1.0
     noise: FloatArray | None = None
     arc_error: float = 0.0
+    error: ModelError | None = None
 
     @property
     def space(self) -> ParameterSpace:

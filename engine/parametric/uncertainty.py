@@ -23,7 +23,7 @@ def parameter_covariance(model: ImageModel, jacobian: FloatArray, held: int | No
 
     H^-1 (H + S) H^-1 with H = J^T J and S what pixels share. Parameter ``held`` has no variance.
     """
-    shared = _shared(model, jacobian[: model.data.size])
+    shared = _shared(model, model.decorrelated(jacobian[: model.data.size]))
     free = np.delete(np.arange(jacobian.shape[1]), [] if held is None else held)
     chosen = jacobian if held is None else jacobian[:, free]
     scale = np.sqrt((chosen**2).sum(axis=0))

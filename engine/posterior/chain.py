@@ -21,6 +21,7 @@ from engine.posterior.optimum import Laplace
 from engine.posterior.surrogate import learn_surrogate
 from engine.posterior.target import Prior, Recorded, Target
 from engine.result import ChainStatus, ChainSummary
+from engine.work import count
 
 _SURROGATE_SHARE = 0.9
 """The remaining differential evolution is for what no surrogate has learnt."""
@@ -94,6 +95,7 @@ def run_chain(
     PosteriorError
         No walker finds a place inside the prior, or none ever moves.
     """
+    count("parameters_sampled", laplace.mean.size)
     random = np.random.RandomState(int(rng.integers(2**32)))
     known = Recorded(target)
     if laplace.known is not None:

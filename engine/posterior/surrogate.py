@@ -10,11 +10,9 @@ invariant however wrong the surrogate is; a wrong one costs acceptance.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RBFInterpolator
+from scipy import linalg
 
 from engine.conventions import FloatArray
 from engine.errors import PosteriorError
@@ -70,19 +68,20 @@ class Surrogate:
         differs = np.maximum(values, top - _DEPTH) - ln_core((z**2).sum(axis=1))
         # The process goes back to zero: where nothing is known the surrogate should be as high as it is elsewhere.
         self._level = float(np.median(differs[values > top - 0.5 * _DEPTH]))
-        self._process = RBFInterpolator(
-            z,
-            differs - self._level,
-            kernel="gaussian",
-            epsilon=1.0 / (math.sqrt(2.0) * _LENGTH),
-            smoothing=_ROUGHNESS,
-            degree=-1,
-        )
+        self._known = z
+        process = self._correlation(z)
+        process[np.diag_indices_from(process)] += _ROUGHNESS
+        self._weights = linalg.cho_solve(linalg.cho_factor(process, lower=True), differs - self._level)
+
+    def _correlation(self, z: FloatArray) -> FloatArray:
+        """Of the process between states (n, d) and the known points (k,), in deviations; (n, k)."""
+        square = (z**2).sum(axis=1)[:, None] + (self._known**2).sum(axis=1) - 2.0 * (z @ self._known.T)
+        return np.asarray(np.exp(-0.5 / _LENGTH**2 * square))
 
     def ln_density(self, states: FloatArray) -> FloatArray:
         """What it takes ln of the target (n,) to be at states (n, d); minus infinity outside the prior."""
         z = self.proposal.whiten(states)
-        found = self._level + ln_core((z**2).sum(axis=1)) + self._process(z)
+        found = self._level + ln_core((z**2).sum(axis=1)) + self._correlation(z) @ self._weights
         return np.where(self._inside(states), found, -np.inf)
 
     def _inside(self, states: FloatArray) -> NDArray[np.bool_]:

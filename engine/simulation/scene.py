@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from engine.catalogue import load_camera, load_dither, load_system
+from engine.catalogue import load_camera, resolve_camera, resolve_dither, resolve_system
 from engine.conventions import image_angle, magnitude_to_rate, sky_to_image, sky_to_image_shear
 from engine.errors import SpecError
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile
-from engine.spec.instrument import NOMINAL_OPTICS, Camera, Dither, Optics
+from engine.spec.instrument import NOMINAL_OPTICS, Camera, Optics
 from engine.spec.realization import Realization
 from engine.spec.sky import AgnImage, LensSystem, MassModel, SersicLight
 
@@ -39,26 +39,6 @@ class Scene:
     deflector: SersicProfile | None
     agn: tuple[PointSource, ...]
     optics: Optics = NOMINAL_OPTICS
-
-
-def resolve_system(realization: Realization) -> LensSystem:
-    """The lens system of a realization, from the catalogue where it is named."""
-    system = realization.system
-    return load_system(system) if isinstance(system, str) else system
-
-
-def resolve_camera(realization: Realization) -> Camera:
-    """The camera of a realization: its own choice, else the system's."""
-    camera = realization.camera
-    if camera is None:
-        camera = resolve_system(realization).camera
-    return load_camera(camera) if isinstance(camera, str) else camera
-
-
-def resolve_dither(system: LensSystem) -> Dither:
-    """The dither pattern of a system's exposures, from the catalogue where it is named."""
-    dither = system.exposures.dither
-    return load_dither(dither) if isinstance(dither, str) else dither
 
 
 def check_system(system: LensSystem) -> None:

@@ -13,10 +13,11 @@ from functools import lru_cache
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from engine.catalogue import resolve_dither
 from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.imaging.convolution import convolve, point_source_image
-from engine.imaging.cusps import place_cusps
+from engine.imaging.cusps import cusp_positions, place_cusps
 from engine.imaging.drizzled_psf import drizzled_psf
 from engine.imaging.drizzling import drizzle, drizzle_weights, drizzled_covariance
 from engine.imaging.exposures import expose
@@ -25,9 +26,8 @@ from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation, Provenance
 from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel, telescope_psf
-from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
-from engine.simulation.scene import Scene, build_scene, resolve_dither
+from engine.simulation.scene import Scene, build_scene
 from engine.simulation.seeds import sky_generator
 from engine.spec.instrument import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
 from engine.spec.realization import Realization
@@ -95,8 +95,8 @@ def high_resolution_host(scene: Scene, geometry: Geometry) -> FloatArray:
 
 def blurred_host(scene: Scene, geometry: Geometry, host: FloatArray) -> FloatArray:
     """The lensed host after the PSF, on the high-resolution grid."""
-    images = solve_lens_equation(scene.lens, scene.host.x, scene.host.y)
-    placed = place_cusps(host, scene.host, [(image.x, image.y) for image in images], geometry, scene.lens)
+    cusps = cusp_positions(scene.host, scene.lens, geometry)
+    placed = place_cusps(host, scene.host, cusps, geometry, scene.lens)
     return convolve(placed, optical_psf(scene.camera, geometry.oversampling, scene.optics))
 
 
@@ -107,8 +107,8 @@ def high_resolution_image(scene: Scene, geometry: Geometry, arc: FloatArray) -> 
     if scene.deflector is not None:
         x, y = geometry.high_resolution_axes()
         light = render_sersic(scene.deflector, x, y, geometry.subpixel_scale)
-        cusp = (scene.deflector.x, scene.deflector.y)
-        image = image + convolve(place_cusps(light, scene.deflector, [cusp], geometry), psf)
+        cusps = cusp_positions(scene.deflector, None, geometry)
+        image = image + convolve(place_cusps(light, scene.deflector, cusps, geometry), psf)
     if scene.agn:
         positions = np.array([(source.x, source.y) for source in scene.agn])
         fluxes = np.array([source.flux for source in scene.agn])

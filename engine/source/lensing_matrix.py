@@ -19,6 +19,7 @@ from engine.errors import InversionError
 from engine.lensing.power_law import PowerLawLens, lens_constants, trace_rays
 from engine.source.envelope import Envelope, PlacedEnvelope
 from engine.source.grid import SourceGrid
+from engine.work import count
 
 FALL = 0.25
 """Width of the fall beyond the edges, in cells: a hundredth of an arcsec, far more than a lens' posterior moves it."""
@@ -79,8 +80,8 @@ class LensingMatrix:
     def dense(self) -> FloatArray:
         """L as an array of shape (pixels, ny nx)."""
         out = np.zeros((self.entries.size, self.grid.x.size * self.grid.y.size))
-        for row, count in enumerate(self.entries):
-            np.add.at(out[row], self.columns[row, :count], self.weights[row, :count])
+        for row, used in enumerate(self.entries):
+            np.add.at(out[row], self.columns[row, :used], self.weights[row, :used])
         return out
 
     def of_brightness(self, envelope: FloatArray) -> LensingMatrix:
@@ -247,6 +248,7 @@ def map_rays(rays: RayBundle, lens: PowerLawLens, shape: tuple[int, int]) -> Len
         raise InversionError("mask: it has no pixel, at least one is needed")
     bx, by = np.empty(rays.x.size), np.empty(rays.x.size)
     trace_rays(rays.x, rays.y, constants, bx, by)
+    count("rays_traced", bx.size)
     per_pixel = rays.subrays**2
     left, right, bottom, top = _bounds(bx, by, rays.in_mask, per_pixel)
     if not (right > left and top > bottom):

@@ -1,11 +1,18 @@
 """``python -m service.api``: the API process, as the supervisor starts it."""
 
+import gc
+
 from service.runtime import start
 
 if __name__ == "__main__":
     start.begin()
-    from service.api.serve import serve
-    from service.runtime.settings import read_settings
+    # Until everything is loaded; serve() turns it on again.
+    gc.disable()
+    # Before what takes a second to load: a mistake is told at once.
+    from service.runtime.settings import Settings, read_settings
 
     with start.refusing():
-        serve(read_settings())
+        settings = read_settings(Settings)
+        from service.api.serve import serve
+
+        serve(settings)

@@ -33,11 +33,13 @@ from service.domain.views import (
     GridKind,
     GridPage,
     GridView,
+    MeasurementView,
     RetriedGrid,
     RunDetail,
     RunPage,
     Summary,
 )
+from service.store.grids import Created
 from service.store.runs import NotFoundError
 
 router = APIRouter(prefix="/v1", tags=["grids"], route_class=JsonRoute)
@@ -81,10 +83,14 @@ def submit(
         caller.name,
         lambda: service.costs.expected_wall_s(planned().kinds()),
     )
+    return accepted(made, link_grid(made.grid))
+
+
+def accepted(made: Created, document: GridView | MeasurementView) -> JSONResponse:
+    """The answer to who asked for work: what it has become, and where that is."""
     _LOG.info("replayed" if made.replayed else "accepted", extra={"grid": made.grid.id, "runs": made.grid.n_runs})
-    grid = link_grid(made.grid)
-    headers = {"Location": grid.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
-    return JSONResponse(grid.model_dump(mode="json"), status_code=202, headers=headers)
+    headers = {"Location": document.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
+    return JSONResponse(document.model_dump(mode="json"), status_code=202, headers=headers)
 
 
 @router.get("/grids")

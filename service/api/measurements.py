@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import JSONResponse
 from starlette.datastructures import FormData, UploadFile
 from starlette.requests import ClientDisconnect
 from starlette.types import Message
@@ -17,7 +15,7 @@ from service.api.context import GridId, Limit, Service
 from service.api.downloads import artefact
 from service.api.freshness import NOT_MODIFIED, IfNoneMatch
 from service.api.gate import Asking
-from service.api.grids import IdempotencyKey
+from service.api.grids import IdempotencyKey, accepted
 from service.api.links import link_measurement
 from service.api.pages import next_link
 from service.api.problems import InvalidRequestError, UnsupportedBodyError, problem
@@ -36,7 +34,6 @@ from service.store.runs import NotFoundError
 
 ADDRESS = "/v1/measurements"
 router = APIRouter(prefix="/v1", tags=["measurements"], route_class=Route)
-_LOG = logging.getLogger(__name__)
 _MULTIPART = "multipart/form-data"
 _MAX_FIELDS = 64
 _MAX_FIELD_BYTES = 10_000
@@ -106,10 +103,7 @@ async def submit(
         PATIENT, service.grids.create, asked, lambda: (planned,), options.name, idempotency_key, engine_digest(),
         caller.name,
     )  # fmt: skip
-    _LOG.info("replayed" if made.replayed else "accepted", extra={"grid": made.grid.id, "runs": 1})
-    found = link_measurement(await run_in(PATIENT, service.measurements.one, made.grid.id))
-    headers = {"Location": found.links["self"], "Idempotency-Replayed": str(made.replayed).lower()}
-    return JSONResponse(found.model_dump(mode="json"), status_code=202, headers=headers)
+    return accepted(made, link_measurement(await run_in(PATIENT, service.measurements.one, made.grid.id)))
 
 
 @router.get("/measurements")

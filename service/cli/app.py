@@ -103,17 +103,19 @@ def serve(
 @app.command()
 def api() -> None:
     """Run one API process alone."""
-    from service.api.serve import serve as serve_api  # noqa: PLC0415 - loads the engine
+    settings = _settings()
+    from service.api.serve import serve as serve_api  # noqa: PLC0415 - takes long, and a mistake is told before
 
-    serve_api(_settings())
+    serve_api(settings)
 
 
 @app.command()
 def dispatcher() -> None:
     """Run one dispatcher process alone; a second one stands by."""
-    from service.dispatcher.dispatch import dispatch  # noqa: PLC0415 - loads Dask
+    settings = _settings()
+    from service.dispatcher.dispatch import dispatch  # noqa: PLC0415 - as above: loads Dask
 
-    raise typer.Exit(dispatch(_settings()))
+    raise typer.Exit(dispatch(settings))
 
 
 @app.command()
@@ -123,9 +125,9 @@ def scheduler(
     health: Annotated[str, typer.Option(help="Address of /health and /metrics")] = "127.0.0.1:8787",
 ) -> None:
     """Run a Dask scheduler for workers on several machines."""
-    from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
-
     settings = _settings()
+    from service.dispatcher import standalone  # noqa: PLC0415 - as above
+
     standalone.become(settings, standalone.scheduler_arguments(settings, host, port, health))
 
 
@@ -136,9 +138,9 @@ def worker(
     health: Annotated[str, typer.Option(help="Address of /health and /metrics of the first")] = "127.0.0.1:0",
 ) -> None:
     """Run workers for a scheduler, here or on another machine."""
-    from service.dispatcher import standalone  # noqa: PLC0415 - loads Dask
-
     settings = _settings(scheduler_address=address, cluster="address")
+    from service.dispatcher import standalone  # noqa: PLC0415 - as above
+
     standalone.become(settings, standalone.worker_arguments(settings, address, workers, health))
 
 

@@ -213,4 +213,9 @@ def _summary(found: ImageMeasurement) -> list[str]:
     if found.host_limit is not None:
         lines.append(f"host: not detected, fainter than {found.host_limit:.2f} mag (95 %)")
     lines.append(f"{len(found.agn)} AGN images, chi2/dof {found.chi2_per_dof:.2f}, {found.estimator}, {found.status}")
-    return lines
+    work = found.work
+    told = f"{work.pixels_rendered:,} pixels rendered, {work.rays_traced:,} rays traced, "
+    told += f"{work.columns_solved:,} columns solved"
+    if work.parameters_sampled:
+        told += f", {work.parameters_sampled} parameters sampled by {work.evidence_evaluations:,} evidence evaluations"
+    return [*lines, told]

@@ -17,11 +17,13 @@ if __name__ == "__main__":
     if os.environ.get("HOSTLENS_CLUSTER", "local") == "local" and "HOSTLENS_SCHEDULER_ADDRESS" not in os.environ:
         # Before all else, so that it loads while this process does; without this, dispatch() starts it.
         prepare_host()
-    from service.dispatcher.dispatch import dispatch
-    from service.runtime.settings import read_settings
+    from service.runtime.settings import Settings, read_settings
 
     try:
         with start.refusing():
-            sys.exit(dispatch(read_settings()))
+            settings = read_settings(Settings)
+            from service.dispatcher.dispatch import dispatch
+
+            sys.exit(dispatch(settings))
     finally:
         end_prepared()

@@ -37,6 +37,8 @@ QUANTITIES = ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", 
 COUNTS = ("draws", "at_bound", "n_at_bound", "r_eff_at_bound", "failed")
 _OF_CHAIN = ("ln_evidence", "chi2", "degrees_of_freedom", "condition_number")
 """What a result has if it has a chain."""
+WORK = ("pixels_rendered", "rays_traced", "columns_solved", "parameters_sampled")
+"""What is counted of a run beside the evaluations of its chain."""
 LENS_PARAMETERS = ("theta_E", "q", "phi", "slope", "x", "y", "gamma1", "gamma2", "ln_lambda")
 
 
@@ -112,6 +114,20 @@ class ChainPayload(_Strict):
     r_hat: NonNegative | None = None
 
 
+class WorkPayload(_Strict):
+    """What simulation and analysis computed, in numbers that no clock changes.
+
+    Pixels onto which light or a derivative of it was laid, rays traced through the lens, unknowns of linear systems
+    solved, dimensions of the chain, evaluations of the evidence.
+    """
+
+    pixels_rendered: Annotated[int, Field(ge=0, lt=2**63)]
+    rays_traced: Annotated[int, Field(ge=0, lt=2**63)]
+    columns_solved: Annotated[int, Field(ge=0, lt=2**63)]
+    parameters_sampled: Annotated[int, Field(ge=0, lt=2**31)]
+    evidence_evaluations: Annotated[int, Field(ge=0, lt=2**63)]
+
+
 class StagePayload(_Strict):
     """Wall and CPU seconds of one stage."""
 
@@ -158,6 +174,7 @@ class ResultPayload(_Strict):
     agn_contrast: Finite | None
     surface_brightness: Finite
     stages: Annotated[tuple[StagePayload, ...], Field(max_length=1000)]
+    work: WorkPayload | None = None
     warnings: Annotated[tuple[Text, ...], Field(max_length=1000)] = ()
     figure: ArtefactPayload | None = None
     products: ArtefactPayload | None = None
@@ -173,6 +190,9 @@ class ResultPayload(_Strict):
         lacking = [name for name in _OF_CHAIN if getattr(self, name) is None]
         if self.chain is not None and lacking:
             raise ValueError(f"a chain without {', '.join(lacking)}")
+        evaluations = 0 if self.chain is None else self.chain.evaluations
+        if self.work is not None and self.work.evidence_evaluations != evaluations:
+            raise ValueError(f"{self.work.evidence_evaluations} evaluations counted, {evaluations} in the chain")
         return self
 
     @property
@@ -225,6 +245,7 @@ def result_payload(
             "agn_contrast": None if result.agn_contrast is None else float(result.agn_contrast),
             "surface_brightness": float(result.surface_brightness),
             "stages": [{"stage": s.stage, "wall_s": float(s.wall_s), "cpu_s": float(s.cpu_s)} for s in result.stages],
+            "work": {name: getattr(result.work, name) for name in WorkPayload.model_fields},
             "warnings": [warning[:2000] for warning in result.warnings],
             "figure": figure,
             "products": products,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, StringConstraints, create_model
 
+import engine
 from engine import (
     PRINTABLE,
     Analysis,
@@ -35,8 +36,6 @@ from engine import (
     SpecError,
     Systems,
     camera_names,
-    check_realization,
-    check_system,
     engine_digest,
     load_camera,
     load_system,
@@ -158,7 +157,7 @@ def _check_own_systems(request: GridRequest) -> None:
     for place, system in enumerate(request.systems or ()):
         if isinstance(system, LensSystem):
             try:
-                check_system(system)
+                engine.check_system(system)  # by its name in the engine: what computes loads with the first grid
             except SpecError as error:
                 field = "exposures.dither" if error.field == "dither" else error.field
                 raise SpecError(f"systems[{place}].{field}", error.value, error.allowed) from error
@@ -172,7 +171,7 @@ def _check_own_systems(request: GridRequest) -> None:
 def _check(request: GridRequest, realization: Realization) -> None:
     """Refuse a realization that no run could end well with, by the place in the request that makes it so."""
     try:
-        check_realization(realization)
+        engine.check_realization(realization)
     except SpecError as error:
         own = error.field.startswith("system.")
         place = (request.systems or ()).index(realization.system) if own else 0

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.domain.payload import ChainPayload, EstimateName, StagePayload
+from service.domain.payload import ChainPayload, EstimateName, StagePayload, WorkPayload
 from service.domain.states import GridState, RunState
 
 UwsPhase = Literal["PENDING", "QUEUED", "HELD", "EXECUTING", "COMPLETED", "ERROR", "ABORTED"]
@@ -300,6 +300,8 @@ class ResultView(_Answer):
     wall_s: float
     cpu_s: float
     stages: list[StagePayload]
+    work: WorkPayload | None
+    """Null in results that are older than this field."""
     warnings: list[str]
     versions: dict[str, str]
     payload_digest: str

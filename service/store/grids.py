@@ -40,7 +40,7 @@ from service.store.runs import IS_IMAGE, WHOLE, NotFoundError, RunStore, require
 from service.store.settling import IS_OPEN, revive_runs, settle
 from service.store.submission import Submission, give_up, store
 from service.store.summary import summarise
-from service.store.tables import event, grid, idempotency, run
+from service.store.tables import grid, idempotency, run
 
 _REOPENED = {"state": GridState.QUEUED, "finished_at": None, "cancelled_at": None, "ending": None}
 _BEGUN = (grid.c.id, grid.c.storing, grid.c.engine_digest, grid.c.created_at)
@@ -287,12 +287,6 @@ class GridStore(RunStore):
                 lock_grids(connection, [grid_id])
                 more = settle(connection, grid_id, self._clock())
         return self.grid(grid_id)
-
-    def stale_results(self) -> int:
-        """How many results came too late so far, over all grids."""
-        with self._database.read() as connection:
-            counted = select(func.count()).select_from(event).where(event.c.kind == "stale_result")
-            return connection.scalar(counted) or 0
 
     def _grid(self, connection: Connection, grid_id: str) -> GridView:
         row = connection.execute(_GRID, {"wanted": grid_id}).one_or_none()

@@ -13,6 +13,7 @@ from service.domain.payload import (
     ESTIMATES,
     LENS_PARAMETERS,
     QUANTITIES,
+    WORK,
     AperturePayload,
     ChainPayload,
     MeasurementPayload,
@@ -61,6 +62,7 @@ def found_columns(payload: ResultPayload) -> dict[str, Any]:
             row[f"{prefix}_{part}"] = None if value is None else getattr(value, part)
     chain = payload.chain
     row |= {column: None if chain is None else getattr(chain, name) for name, column in _CHAIN.items()}
+    row |= {name: None if payload.work is None else getattr(payload.work, name) for name in WORK}
     return row | {name: getattr(payload, name) for name in _PLAIN}
 
 

@@ -8,7 +8,15 @@ from typing import Any
 
 from sqlalchemy import Row, RowMapping
 
-from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, ChainPayload, estimator_and_prior
+from service.domain.payload import (
+    COUNTS,
+    ESTIMATES,
+    LENS_PARAMETERS,
+    QUANTITIES,
+    WORK,
+    ChainPayload,
+    estimator_and_prior,
+)
 from service.domain.states import GridState, RunState
 from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunItem, RunView
 from service.store.pace import Recent
@@ -35,7 +43,7 @@ ESTIMATE_COLUMNS = (
 _ESTIMATES = {name: estimator_and_prior(name) for name in ESTIMATES}
 _LENS = {name: tuple(f"lens_{name.lower()}_{part}" for part in ("mean", "sd", "truth")) for name in LENS_PARAMETERS}
 _CHAIN = {name: "chain_status" if name == "status" else name for name in ChainPayload.model_fields}
-_GATHERED = ("estimates", "aperture", "regularisation", "profile", "lens", "chain")
+_GATHERED = ("estimates", "aperture", "regularisation", "profile", "lens", "chain", "work")
 _PLAIN = tuple(name for name in ResultView.model_fields if name not in _GATHERED)
 
 
@@ -148,6 +156,7 @@ def _result(row: Row[Any], estimates: Sequence[Row[Any]]) -> dict[str, Any]:
         "profile": row.profile,
         "lens": lens,
         "chain": None if row.chain_status is None else {name: column[place] for name, place in _CHAIN.items()},
+        "work": _work(column),
         **{name: column[name] for name in _PLAIN},
     }
 
@@ -162,6 +171,12 @@ def _estimate(row: Row[Any]) -> dict[str, Any]:
     for part in COUNTS:
         found[part] = next(values)
     return found
+
+
+def _work(column: RowMapping) -> dict[str, Any] | None:
+    if column["rays_traced"] is None:
+        return None
+    return {**{name: column[name] for name in WORK}, "evidence_evaluations": column["evaluations"] or 0}
 
 
 def _aperture(column: RowMapping) -> dict[str, Any] | None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, false, func, literal_column, select
+from sqlalchemy import Connection, Row, Select, bindparam, false, func, literal_column, select
 
 from service.domain.plan import IMAGE
 from service.domain.states import RunState
@@ -62,27 +63,27 @@ class RunStore:
 
     def runs(self, grid_id: str, limit: int, after: int = -1, state: RunState | None = None) -> RunPage:
         """A page of a grid's runs; ``next`` holds the cursor."""
-        wanted = select(*RUN_COLUMNS).where(run.c.grid_id == grid_id, run.c.ordinal > after)
-        if state is not None:
-            wanted = wanted.where(run.c.state == state)
-        with self._database.read() as connection:
-            require_grid(connection, grid_id)
-            rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
-        items = [run_view(row) for row in rows[:limit]]
-        return RunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
+        rows, following = self._page(select(*RUN_COLUMNS), grid_id, limit, after, state)
+        return RunPage(items=[run_view(row) for row in rows], next=following)
 
     def run_items(self, grid_id: str, limit: int, after: int = -1, state: RunState | None = None) -> CompactRunPage:
         """A page of a grid's runs in short; ``links`` of each has the keys of its artefacts."""
         columns = (run.c.id, run.c.ordinal, run.c.label, run.c.state, run.c.error_code, run.c.finished_at)
         wanted = select(*columns, result.c.figure, result.c.products).outerjoin(result, result.c.run_id == run.c.id)
+        rows, following = self._page(wanted, grid_id, limit, after, state)
+        return CompactRunPage(items=[run_item(row) for row in rows], next=following)
+
+    def _page(
+        self, wanted: Select[Any], grid_id: str, limit: int, after: int, state: RunState | None
+    ) -> tuple[Sequence[Row[Any]], str | None]:
+        """Rows of a grid's runs, of any columns, and the cursor behind them where there are more."""
         wanted = wanted.where(run.c.grid_id == grid_id, run.c.ordinal > after)
         if state is not None:
             wanted = wanted.where(run.c.state == state)
         with self._database.read() as connection:
             require_grid(connection, grid_id)
             rows = connection.execute(wanted.order_by(run.c.ordinal).limit(limit + 1)).all()
-        items = [run_item(row) for row in rows[:limit]]
-        return CompactRunPage(items=items, next=str(items[-1].ordinal) if len(rows) > limit else None)
+        return rows[:limit], str(rows[limit - 1].ordinal) if len(rows) > limit else None
 
     def run_version(self, wanted: str) -> tuple[Any, ...]:
         """What changes whenever a run's document does, without reading that."""

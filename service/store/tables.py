@@ -28,9 +28,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.domain.payload import COUNTS, LENS_PARAMETERS, QUANTITIES
+from service.domain.payload import COUNTS, LENS_PARAMETERS, QUANTITIES, WORK
 
-REVISION = "0009"
+REVISION = "0011"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -275,6 +275,8 @@ result = Table(
     Column("wall_s", Float, nullable=False),
     Column("cpu_s", Float, nullable=False),
     Column("stages", JSON, nullable=False),
+    # Null in results that are older; evaluations of the evidence stand with the chain.
+    *(Column(name, BigInteger) for name in WORK),
     Column("payload_digest", String(64), nullable=False),
     Column("engine_digest", String(64), nullable=False),
     Column("versions", JSON, nullable=False),

@@ -53,6 +53,11 @@ def signed(value: float | None, digits: int = 3) -> str:
     return f"{value:+.{digits}f}".replace("-", MINUS)
 
 
+def count(value: int) -> str:
+    """A whole number of any size, its thousands apart."""
+    return f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
 def percent(value: float | None) -> str:
     """A share."""
     return "\N{EM DASH}" if value is None or not math.isfinite(value) else f"{100.0 * value:.0f} %"
@@ -100,7 +105,7 @@ def _made() -> Environment:
     )
     environment.filters |= {
         "number": number, "signed": signed, "percent": percent, "when": when, "duration": duration,
-        "estimate_name": estimate_name,
+        "estimate_name": estimate_name, "count": count,
     }  # fmt: skip
     environment.globals |= {"version": VERSION}
     return environment

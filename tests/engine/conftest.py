@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lenstronomy.Util import numba_util
 
 from engine.catalogue import load_system
 from engine.parametric.fit import ParametricFit, fit_parametric
@@ -12,6 +13,9 @@ from engine.simulation.simulate import Simulation, simulate
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
 from engine.spec.sky import Host, LensSystem
+
+# As plain Python: to compile what the tests ask of lenstronomy takes fifteen seconds, and saves a tenth of one.
+numba_util.numba_enabled = False
 
 QUICK = Analysis(source_pixels=(12, 12), subrays=1, psf_radius=8, max_steps=10, draws=4)
 """An analysis of seconds, for what does not depend on its quality."""

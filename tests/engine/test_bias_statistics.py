@@ -24,6 +24,7 @@ from engine.figures import (
     trend_figure,
 )
 from engine.result import ChainSummary, Estimate, Quantity, RunResult
+from engine.work import Work
 from tests.engine.bias_records import (
     bands,
     bars,
@@ -167,7 +168,7 @@ def test_points_of_a_result_have_every_estimate_with_its_truth():
         regularisation="curvature", estimates=estimates, aperture=None, lens=(),
         chain=ChainSummary("converged", 8, 10, 1, 1.0, 10.0, 0.3, 80), ln_evidence=0.0, chi2=1.0,
         degrees_of_freedom=1, condition_number=1.0, arc_magnitude=18.5, agn_contrast=-1.5, surface_brightness=20.5,
-        stages=(),
+        stages=(), work=Work(),
     )  # fmt: skip
     first, second = bias_points("r7", spec, result)
     assert (first.system, first.configuration, first.setting, first.magnitude) == (

@@ -32,9 +32,10 @@ def lenstronomy_images(lens: PowerLawLens, x: float, y: float) -> list[tuple[flo
         {"gamma1": lens.gamma1, "gamma2": lens.gamma2},
     ]
     model = LensModel(["EPL", "SHEAR"])
-    px, py = LensEquationSolver(model).image_position_from_source(
-        x, y, kwargs, solver="analytical", magnification_limit=1e-2
-    )
+    with np.errstate(all="ignore"):  # it looks for its roots beyond where there are numbers, too
+        px, py = LensEquationSolver(model).image_position_from_source(
+            x, y, kwargs, solver="analytical", magnification_limit=1e-2
+        )
     return list(zip(px, py, model.magnification(px, py, kwargs), strict=True))
 
 
@@ -55,10 +56,9 @@ def random_configurations(number: int) -> list[tuple[PowerLawLens, float, float]
     return out
 
 
-@pytest.mark.parametrize("number", [4, pytest.param(25, marks=pytest.mark.long)])
-def test_the_images_are_those_of_lenstronomy(number: int) -> None:
+def test_the_images_are_those_of_lenstronomy() -> None:
     # A few, by a code that everybody knows; as many as one likes by the solver below.
-    for lens, x, y in random_configurations(number):
+    for lens, x, y in random_configurations(25):
         ours, theirs = solve_lens_equation(lens, x, y), lenstronomy_images(lens, x, y)
         assert len(ours) == len(theirs), (lens, x, y)
         for px, py, mu in theirs:

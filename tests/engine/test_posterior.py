@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from engine.errors import PosteriorError
-from engine.likelihood.w_tilde import together
+from engine.likelihood.curvature import together
 from engine.posterior.chain import autocorrelation_time, run_chain
 from engine.posterior.optimum import Laplace, find_optimum, optimal_strength, start_covariance
 from engine.posterior.proposal import StudentProposal
@@ -40,6 +40,16 @@ def test_the_optimum_of_a_gaussian_is_found_with_its_covariance() -> None:
     laplace = find_optimum(target, start, np.eye(5))
     assert np.allclose(laplace.mean, target.mean, atol=1e-6)
     assert np.allclose(laplace.covariance, target.covariance, rtol=1e-5)
+
+
+def test_mixed_derivatives_are_measured_once_where_the_scale_is_about_right() -> None:
+    target, d = Gaussian(), 5
+    start = target.mean + np.linalg.cholesky(target.covariance) @ np.full(d, 0.8)
+    laplace = find_optimum(target, start, 2.0 * target.covariance)
+    assert np.allclose(laplace.mean, target.mean, atol=1e-6)
+    assert np.allclose(laplace.covariance, target.covariance, rtol=1e-5)
+    # The start; steps along the axes both ways and the trial, twice; the pairs of axes.
+    assert target.evaluations == 1 + 2 * (2 * d + 1) + d * (d - 1) // 2
 
 
 def test_the_chain_samples_a_gaussian_from_a_poor_approximation() -> None:

@@ -9,9 +9,10 @@ from scipy import sparse
 from engine.errors import InversionError
 from engine.imaging.optics.stamp_matrix import blurring_matrix
 from engine.likelihood.amplitudes import LinearData, MarginalLikelihood, marginalise_amplitudes
+from engine.likelihood.curvature import curvature_matrix
 from engine.likelihood.evidence import ln_evidence
 from engine.likelihood.noise import factorise_noise
-from engine.likelihood.w_tilde import TILE, compute_w_tilde, curvature_matrix
+from engine.likelihood.w_tilde import TILE, compute_w_tilde
 from engine.source.lensing_matrix import LensingMatrix, cast_rays, map_rays
 from engine.source.regularisation import SourceModel
 from tests.engine.dense_oracle import LENS, SCALE
@@ -73,6 +74,29 @@ def test_the_blocks_hold_the_whole_of_w_and_leave_out_what_does_not_interact(cor
     assert np.abs(likelihood.w_tilde.dense() - plain).max() < 1e-14 * np.abs(plain).max()
     patches = -(-b.shape[1] // TILE)
     assert likelihood.w_tilde.blocks.shape[0] < (0.7 if correlation == 0.0 else 1.01) * patches * (patches + 1) / 2
+
+
+def test_under_a_covariance_only_what_is_next_to_nothing_is_left_out() -> None:
+    # A strip ten times as long as light and the inverse of the covariance reach, so that both substitutions end early.
+    shape, rng = (150, 6), np.random.default_rng(5)
+    lit = np.ones(shape, dtype=bool)
+    axes = (np.arange(size) * SCALE for size in shape[::-1])
+    rays = cast_rays(lit, np.zeros(shape, dtype=bool), *axes, SCALE, 1)
+    blurring = blurring_matrix(rng.uniform(0.5, 1.0, (5, 5)), np.nonzero(lit), np.nonzero(lit))
+    near = np.full((3, 3), 0.05)
+    near[1, 1] = 1.0
+    # Pixels that are left out by their noise are as quiet as the end of a substitution, and are none.
+    deviations = sparse.diags(np.where(np.arange(lit.size) % 7 == 0, 1e18, rng.uniform(0.8, 1.2, lit.size)))
+    noise = factorise_noise(deviations @ blurring_matrix(near, np.nonzero(lit), np.nonzero(lit)) @ deviations)
+    w_tilde = compute_w_tilde(blurring, noise, rays)
+    white = noise.whiten(blurring.toarray())
+    plain = white.T @ white
+    scale = np.sqrt(np.diag(plain))
+    # Entries below 1e-12 of their diagonals may be missing; the plain matrix rounds by less than that.
+    assert (np.abs(w_tilde.dense() - plain) / np.outer(scale, scale)).max() < 1.1e-12
+    patches = w_tilde.start.size - 1
+    assert w_tilde.blocks.shape[0] < 0.5 * patches * (patches + 1) / 2
+    assert w_tilde.blocks.ctypes.data % 64 == 0
 
 
 def test_a_column_of_the_blurring_that_is_no_pixel_takes_part_in_the_evidence() -> None:

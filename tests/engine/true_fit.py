@@ -28,6 +28,8 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         model=np.zeros(shape),
         arc=np.zeros(shape),
         sigma=np.full(shape, np.inf),
+        psf=np.ones((1, 1)),
+        error=None,
         chi2=0.0,
         degrees_of_freedom=1,
     )

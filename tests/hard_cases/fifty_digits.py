@@ -119,3 +119,83 @@ def ring(number: int, low: float, high: float) -> list[tuple[float, float]]:
     return [
         (r * math.cos(2.4 * k), r * math.sin(2.4 * k)) for k, r in enumerate(np.geomspace(low, high, number).tolist())
     ]
+
+
+def pixel_flux(profile: SersicProfile, x: float, y: float, side: float) -> float:
+    """Flux of a profile with phi = 0 in a square pixel, its cusp inside or not.
+
+    With R the elliptical radius and F(R) the flux within it, F(R) / (2 pi R^2) times the position has the brightness
+    for its divergence: the flux is what of that field leaves through the pixel's sides, where nothing is singular.
+    """
+    with mpmath.workdps(DIGITS):
+        n, root = mpmath.mpf(profile.n), mpmath.sqrt(mpmath.mpf(profile.q))
+        k = mpmath.findroot(
+            lambda value: mpmath.gammainc(2 * n, 0, value, regularized=True) - mpmath.mpf("0.5"), 2 * n - 1 / 3
+        )
+
+        def leaving(u: mpmath.mpf, v: mpmath.mpf) -> mpmath.mpf:
+            squared = u * u + v * v
+            within = mpmath.gammainc(2 * n, 0, k * (mpmath.sqrt(squared) / profile.r_eff) ** (1 / n), regularized=True)
+            return profile.flux * within / (2 * mpmath.pi * squared)
+
+        half = mpmath.mpf(side) / 2
+        left, right = ((mpmath.mpf(x) - profile.x + sign * half) * root for sign in (-1, 1))
+        low, high = ((mpmath.mpf(y) - profile.y + sign * half) / root for sign in (-1, 1))
+        across = [left, mpmath.mpf(0), right] if left < 0 < right else [left, right]
+        up = [low, mpmath.mpf(0), high] if low < 0 < high else [low, high]
+        total = mpmath.mpf(0)
+        for edge, sign in ((left, -1), (right, 1)):
+            total += sign * edge * mpmath.quad(lambda v, edge=edge: leaving(edge, v), up)
+        for edge, sign in ((low, -1), (high, 1)):
+            total += sign * edge * mpmath.quad(lambda u, edge=edge: leaving(u, edge), across)
+        return float(total)
+
+
+def weighted_products(columns: np.ndarray, noise: np.ndarray, pairs: list[tuple[int, int]]) -> list[float]:
+    """Elements of B^T C^-1 B for B (M, P) and the standard deviations (M,) of independent noise."""
+    with mpmath.workdps(DIGITS):
+        exact = np.vectorize(mpmath.mpf, otypes=[object])
+        white = exact(columns) / exact(noise)[:, None]
+        return [float(white[:, i] @ white[:, j]) for i, j in pairs]
+
+
+def moved_in_fourier_space(psf: np.ndarray, size: int, guard: int, dx: float, dy: float) -> np.ndarray:
+    """A stamp padded to ``size`` (odd) pixels a side, moved by (dx, dy) pixels and averaged over each pixel."""
+    with mpmath.workdps(DIGITS):
+        frequencies = [mpmath.mpf(f - size if f > size // 2 else f) / size for f in range(size)]
+
+        def along(shift: float) -> np.ndarray:
+            def wave(m: int, f: mpmath.mpf) -> mpmath.mpf:
+                return mpmath.sincpi(f) * mpmath.cos(2 * mpmath.pi * f * (m - mpmath.mpf(shift)))
+
+            kernel = [mpmath.fsum(wave(m, f) for f in frequencies) / size for m in range(size)]
+            return np.array([[kernel[(out - at) % size] for at in range(size)] for out in range(size)], dtype=object)
+
+        padded = np.full((size, size), mpmath.mpf(0), dtype=object)
+        inside = slice(guard, guard + len(psf))
+        padded[inside, inside] = np.vectorize(mpmath.mpf, otypes=[object])(psf)
+        return np.asarray(along(dy) @ padded @ along(dx).T).astype(float)
+
+
+def spline_between(values: np.ndarray, offset: float) -> np.ndarray:
+    """A cubic spline through ``values`` (n,), nothing beyond, seen at whole numbers less ``offset``, from -1 to n + 1.
+
+    The coefficients are those of scipy's filter with mirrored ends, on the values with one zero on each side.
+    """
+    with mpmath.workdps(DIGITS):
+        padded = [mpmath.mpf(0), *map(mpmath.mpf, values.tolist()), mpmath.mpf(0)]
+        n = len(padded)
+        matrix = mpmath.zeros(n, n)
+        for i in range(n):
+            matrix[i, i] = mpmath.mpf(4) / 6
+            for beside in (i - 1, i + 1):
+                matrix[i, abs(beside) if beside < n else 2 * (n - 1) - beside] += mpmath.mpf(1) / 6
+        coefficients = mpmath.lu_solve(matrix, mpmath.matrix(padded))
+
+        def basis(t: mpmath.mpf) -> mpmath.mpf:
+            t = abs(t)
+            return (4 - 6 * t**2 + 3 * t**3) / 6 if t < 1 else (2 - t) ** 3 / 6 if t < 2 else mpmath.mpf(0)
+
+        shift = mpmath.mpf(offset)
+        seen = [mpmath.fsum(coefficients[k] * basis(m - k - shift) for k in range(n)) for m in range(n)]
+        return np.array([float(value) for value in seen])

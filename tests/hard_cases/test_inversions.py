@@ -117,43 +117,6 @@ def test_a_lens_outside_the_formulas_is_refused() -> None:
 # Components
 
 
-@pytest.mark.parametrize("columns", [(), ("deflector", "background"), ("agn", "background"), ("agn",)])
-def test_a_component_that_is_left_out_changes_nothing_where_its_flux_is_known_to_be_zero(
-    columns: tuple[str, ...],
-) -> None:
-    """A scene without AGN, deflector or background, each left out or held at zero.
-
-    Could go wrong: a component that is not there costs or changes something. Holds: ln Z is the same to 1e-8.
-    """
-    # A column whose amplitude is held at zero by a measurement far better than the data equals no column: the
-    # evidence differs by the density of that measurement alone.
-    scene = Explicit(columns=columns)
-    full = Explicit(columns=(*columns, *(c for c in ("agn", "deflector", "background") if c not in columns)))
-    assert np.array_equal(full.linear.columns[:, : scene.linear.columns.shape[1]], scene.linear.columns)
-    data, extra = scene.linear.data, full.linear.columns.shape[1] - scene.linear.columns.shape[1]
-    k, sigma = full.linear.columns.shape[1], 1e-6
-    # One more datum for each extra amplitude, far from every ray: a pixel that nothing else shines on.
-    far = np.arange(extra) + 10_000
-    rows, cols = np.nonzero(scene.chosen)
-    held = np.zeros((extra, k))
-    held[np.arange(extra), k - extra + np.arange(extra)] = 1.0
-    likelihood = stamp_likelihood(
-        LinearData(
-            np.concatenate([data, np.zeros(extra)]),
-            np.concatenate([scene.linear.covariance, np.full(extra, sigma**2)]),
-            np.vstack([full.linear.columns, held]),
-        ),
-        stamp(scene.psf),
-        scene.likelihood().rays,
-        (np.concatenate([rows, far]), np.concatenate([cols, far])),
-        np.nonzero(scene.rayed),
-    )
-    # The flat prior of each amplitude integrates its measurement to one.
-    assert ln_evidence(likelihood, LENS, 0.0, MODEL) == pytest.approx(
-        ln_evidence(scene.likelihood(), LENS, 0.0, MODEL), rel=1e-8
-    )
-
-
 def test_agn_ten_magnitudes_above_the_host_leave_its_source_alone() -> None:
     """AGN ten magnitudes brighter, as in HS2209.
 

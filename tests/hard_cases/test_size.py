@@ -71,7 +71,6 @@ def test_a_mask_of_twenty_thousand_pixels_fits_into_two_gibibytes() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(strict=True, reason="the process peaks at 2.06 GiB (2,211,487,744 bytes)")
 def test_a_mask_of_twenty_thousand_pixels_with_correlated_noise_fits_into_two_gibibytes() -> None:
     """The same ring with the covariance of drizzled noise.
 

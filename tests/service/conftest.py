@@ -50,11 +50,11 @@ def postgres_server() -> Iterator[str]:
         yield own.url("%s")
 
 
-def new_database(server: str, name: str) -> str:
-    """An empty database on a server; its URL."""
+def new_database(server: str, name: str, like: str = "template1") -> str:
+    """A database on a server, empty or like another that nobody is connected to; its URL."""
     engine = create_engine(server % "postgres", isolation_level="AUTOCOMMIT")
     with engine.connect() as connection:
-        connection.execute(text(f'CREATE DATABASE "{name}"'))
+        connection.execute(text(f'CREATE DATABASE "{name}" TEMPLATE "{like}"'))
     engine.dispose()
     return server % name
 

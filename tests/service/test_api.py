@@ -20,7 +20,7 @@ from service.store.leadership import Leadership
 from service.store.migrate import upgrade
 from service.store.queue import RunQueue
 from tests.service.plans import BODY, body, result_of
-from tests.service.tasks import PNG
+from tests.service.tasks import PNG, synthetic_payload
 
 UNKNOWN_GRID = "g_" + "0" * 26
 
@@ -124,6 +124,7 @@ def test_results_summary_and_figure_of_a_finished_grid(api: TestClient, settings
     assert (grid["state"], grid["uws_phase"], grid["progress"]) == ("done", "COMPLETED", 1.0)
     runs = [api.get(run["links"]["self"]).json() for run in api.get(grid["links"]["runs"]).json()["items"]]
     assert [attempt["outcome"] for attempt in runs[0]["attempts"]] == ["done"]
+    assert runs[0]["result"]["work"] == synthetic_payload(runs[0]["spec"])["work"]
     summary = api.get(grid["links"]["summary"]).json()
     assert (summary["n_runs"], summary["n_stored"], len(summary["rows"])) == (6, 6, 2)
     row = summary["rows"][0]

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import ast
+import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 import service
 from tests.sources import parsed
@@ -63,3 +68,11 @@ def test_the_service_uses_the_face_of_the_engine_alone() -> None:
     for file in FOLDER.rglob("*.py"):
         named = {name for name in imports(file) if name.split(".")[0] == "engine"}
         assert named <= allowed, f"{file.relative_to(FOLDER)}: {sorted(named - allowed)}"
+
+
+@pytest.mark.parametrize("module", ["service.api.serve", "service.dispatcher.dispatch", "service.runtime.supervisor"])
+def test_a_process_that_computes_nothing_starts_without_what_computes(module: str) -> None:
+    """It would be half of the start; the API loads it with the first grid that it is asked for."""
+    program = f"import json, sys, {module}; print(json.dumps(sorted(sys.modules)))"
+    loaded = json.loads(subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True).stdout)
+    assert not {"numba", "scipy", "astropy", "matplotlib", "pyarrow", "engine.lensing", "engine.imaging"} & set(loaded)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, inspect, text
+from sqlalchemy import Connection, inspect, make_url, text
 from typer.testing import CliRunner
 
 from service.cli.app import app
@@ -33,6 +33,8 @@ from tests.service.conftest import new_database
 from tests.service.plans import result_of, submit
 from tests.service.service_process import ROOT
 
+HEAD = revisions()[-1]
+
 
 @pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
 def backend(request: pytest.FixtureRequest) -> str:
@@ -40,33 +42,44 @@ def backend(request: pytest.FixtureRequest) -> str:
 
 
 class Empties:
-    """Empty databases of one kind, as many as a test wants."""
+    """Databases of one kind without rows, as many as a test wants."""
 
-    def __init__(self, backend: str, folder: Path, server: str | None) -> None:
-        self._backend, self._folder, self._server = backend, folder, server
+    def __init__(self, folder: Path, server: str | None) -> None:
+        self._folder, self._server = folder, server
         self._made = 0
+        self._migrated: dict[str, str] = {}
 
-    def __call__(self) -> str:
+    def __call__(self, like: str = "template1") -> str:
         self._made += 1
-        if self._server is None:
-            file = self._folder / f"{self._made}.sqlite"
-            file.touch()
-            return f"sqlite:///{file}"
-        return new_database(self._server, f"migrations_{self._folder.name}_{self._made}")
+        if self._server is not None:
+            return new_database(self._server, f"migrations_{self._folder.name}_{self._made}", like)
+        file = self._folder / f"{self._made}.sqlite"
+        file.touch()
+        return f"sqlite:///{file}"
 
-
-@pytest.fixture
-def empties(backend: str, request: pytest.FixtureRequest, tmp_path: Path) -> Empties:
-    return Empties(backend, tmp_path, request.getfixturevalue("postgres_server") if backend == "postgresql" else None)
+    def at(self, revision: str) -> str:
+        """One that has been brought to a revision: what that takes is done once for each."""
+        if revision not in self._migrated:
+            self._migrated[revision] = self()
+            upgrade(self._migrated[revision], revision)
+        template = self._migrated[revision]
+        if self._server is not None:
+            return self(like=str(make_url(template).database))
+        url = self()
+        shutil.copy(template.removeprefix("sqlite:///"), url.removeprefix("sqlite:///"))
+        return url
 
 
 @pytest.fixture(scope="module")
-def lived(backend: str, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> history.Rows:
-    """What a service of today leaves in its database."""
+def empties(backend: str, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Empties:
     server = request.getfixturevalue("postgres_server") if backend == "postgresql" else None
-    url = Empties(backend, tmp_path_factory.mktemp("lived"), server)()
-    upgrade(url)
-    database = Database(url, pooled=False)
+    return Empties(tmp_path_factory.mktemp("migrations"), server)
+
+
+@pytest.fixture(scope="module")
+def lived(empties: Empties) -> history.Rows:
+    """What a service of today leaves in its database."""
+    database = Database(empties.at(HEAD), pooled=False)
     history.live(database)
     with database.read() as connection:
         rows = history.typed(connection)
@@ -83,8 +96,7 @@ def test_the_tree_is_one_line() -> None:
 def test_rows_of_every_revision_outlive_the_upgrade_the_downgrade_and_the_next_upgrade(
     revision: str, empties: Empties, lived: history.Rows
 ) -> None:
-    url = empties()
-    upgrade(url, revision)
+    url = empties.at(revision)
     assert current(url) == revision
     database = Database(url, pooled=False)
     with database.write() as connection:
@@ -152,9 +164,8 @@ def _assert_working(database: Database) -> None:
 
 def test_migrated_tables_are_the_code_s_to_the_last_constraint(empties: Empties) -> None:
     # alembic check compares neither check constraints nor the conditions of partial indices.
-    migrated, created = empties(), empties()
-    assert differences(migrated) is not None
-    upgrade(migrated)
+    migrated, created = empties.at(HEAD), empties()
+    assert differences(created) is not None
     assert differences(migrated) is None
     database = Database(created, pooled=False)
     with database.write() as connection:
@@ -194,24 +205,21 @@ def _conditions(index: Any) -> str:
 
 
 @pytest.mark.postgres
-def test_postgresql_looks_only_at_columns_that_rows_are_looked_for_by(postgres_server: str) -> None:
+def test_postgresql_looks_only_at_columns_that_rows_are_looked_for_by(migrated_postgres: str) -> None:
     """A column that a migration adds to these tables needs its statistics turned off: see revision 0008."""
-    url = new_database(postgres_server, "statistics")
-    upgrade(url)
     for table in (result, estimate, input_moments, grid_moments):
         kept = (
             "select attname from pg_attribute where attrelid = cast(:table as regclass) and attnum > 0 "
             "and not attisdropped and coalesce(attstattarget, -1) <> 0"
         )
-        with Database(url, pooled=False).read() as connection:
+        with Database(migrated_postgres, pooled=False).read() as connection:
             found = set(connection.scalars(text(kept), {"table": table.name}))
         keys = {"run_id", "grid_id", "input_id", "estimator", "index_prior", "observation_digest"}
         assert found == {*keys, *GROUP_COLUMNS} & set(table.c.keys())
 
 
 def test_base_leaves_no_table_and_can_be_upgraded_again(empties: Empties) -> None:
-    url = empties()
-    upgrade(url)
+    url = empties.at(HEAD)
     upgrade(url)
     downgrade(url, "base")
     database = Database(url, pooled=False)
@@ -223,8 +231,7 @@ def test_base_leaves_no_table_and_can_be_upgraded_again(empties: Empties) -> Non
 
 
 def test_paused_runs_wait_in_the_queue_of_a_code_that_knows_no_pause(empties: Empties) -> None:
-    url = empties()
-    upgrade(url)
+    url = empties.at(HEAD)
     database = Database(url, pooled=False)
     grids, queue = GridStore(database), RunQueue(database)
     grid_id = submit(grids, 2)
@@ -240,8 +247,7 @@ def test_paused_runs_wait_in_the_queue_of_a_code_that_knows_no_pause(empties: Em
 
 
 def test_what_older_results_did_not_hold_is_null_after_the_upgrade(empties: Empties, lived: history.Rows) -> None:
-    url = empties()
-    upgrade(url, "0003")
+    url = empties.at("0003")
     database = Database(url, pooled=False)
     with database.write() as connection:
         history.write(connection, lived)
@@ -260,8 +266,7 @@ def test_what_older_results_did_not_hold_is_null_after_the_upgrade(empties: Empt
 
 
 def test_results_that_an_older_revision_cannot_hold_stop_the_downgrade(empties: Empties) -> None:
-    url = empties()
-    upgrade(url)
+    url = empties.at(HEAD)
     database = Database(url, pooled=False)
     grids, queue = GridStore(database), RunQueue(database)
     submit(grids, 1)
@@ -278,7 +283,7 @@ def test_results_that_an_older_revision_cannot_hold_stop_the_downgrade(empties: 
     assert shown.estimates["image_wide"] is not None
     with pytest.raises(MigrationError, match="1 results lack an estimate"):
         downgrade(url, "0003")
-    assert current(url) == revisions()[-1]
+    assert current(url) == HEAD
     assert grids.run(lease.run_id).result == shown
 
 
@@ -311,7 +316,7 @@ def downgrade():
 
 def _with_next(folder: Path, more: str = "") -> Path:
     shutil.copytree(migrations_folder(), folder)
-    text = NEXT.format(head=revisions()[-1], more=more)
+    text = NEXT.format(head=HEAD, more=more)
     (folder / "versions" / "next.py").write_text(text, encoding="utf-8")
     return folder
 
@@ -319,8 +324,7 @@ def _with_next(folder: Path, more: str = "") -> Path:
 def test_a_table_that_others_refer_to_can_be_copied_without_losing_their_rows(
     empties: Empties, lived: history.Rows, tmp_path: Path
 ) -> None:
-    url = empties()
-    upgrade(url)
+    url = empties.at(HEAD)
     database = Database(url, pooled=False)
     with database.write() as connection:
         history.write(connection, lived)
@@ -328,7 +332,7 @@ def test_a_table_that_others_refer_to_can_be_copied_without_losing_their_rows(
     folder = _with_next(tmp_path / "tree")
     upgrade(url, folder=folder)
     _assert_kept(database, before)
-    downgrade(url, revisions()[-1], folder)
+    downgrade(url, HEAD, folder)
     with database.read() as connection:
         assert history.read(connection) == before
     assert differences(url) is None
@@ -337,8 +341,7 @@ def test_a_table_that_others_refer_to_can_be_copied_without_losing_their_rows(
 def test_a_migration_that_leaves_rows_without_their_run_changes_nothing(
     empties: Empties, backend: str, lived: history.Rows, tmp_path: Path
 ) -> None:
-    url = empties()
-    upgrade(url)
+    url = empties.at(HEAD)
     database = Database(url, pooled=False)
     with database.write() as connection:
         history.write(connection, lived)
@@ -348,7 +351,7 @@ def test_a_migration_that_leaves_rows_without_their_run_changes_nothing(
         upgrade(url, folder=folder)
     with database.read() as connection:
         assert history.read(connection) == before
-    assert current(url) == revisions()[-1]
+    assert current(url) == HEAD
 
 
 def test_a_database_of_a_newer_hostlens_is_refused(empties: Empties, tmp_path: Path) -> None:
@@ -362,17 +365,16 @@ def test_a_database_of_a_newer_hostlens_is_refused(empties: Empties, tmp_path: P
 def test_the_command_line_migrates(empties: Empties, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOSTLENS_DATABASE_URL", empties())
     monkeypatch.setenv("HOSTLENS_DATA_DIR", str(tmp_path / "data"))
-    head = revisions()[-1]
     run = CliRunner()
-    assert run.invoke(app, ["db", "current"]).output == f"database base, code {head}\n"
+    assert run.invoke(app, ["db", "current"]).output == f"database base, code {HEAD}\n"
     assert run.invoke(app, ["db", "check"]).exit_code == 1
-    assert run.invoke(app, ["db", "upgrade"]).output == f"the database is at revision {head}\n"
-    assert run.invoke(app, ["db", "current"]).output == f"database {head}, code {head}\n"
+    assert run.invoke(app, ["db", "upgrade"]).output == f"the database is at revision {HEAD}\n"
+    assert run.invoke(app, ["db", "current"]).output == f"database {HEAD}, code {HEAD}\n"
     assert run.invoke(app, ["db", "check"]).exit_code == 0
     assert run.invoke(app, ["db", "downgrade", "base"], input="n\n").exit_code == 1
     assert run.invoke(app, ["db", "check"]).exit_code == 0
     assert run.invoke(app, ["db", "downgrade", "base", "--yes"]).exit_code == 0
-    assert run.invoke(app, ["db", "current"]).output == f"database base, code {head}\n"
+    assert run.invoke(app, ["db", "current"]).output == f"database base, code {HEAD}\n"
     refused = run.invoke(app, ["db", "upgrade", "9999"])
     assert refused.exit_code == 2
     assert "9999" in refused.output

@@ -34,13 +34,21 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import ESTIMATORS, Analysis
+from engine.work import Work
 from service.api.app import create_app
 from service.cli.app import app
 from service.dispatcher.identity import is_dead, own_name
 from service.dispatcher.outcomes import OtherEngine, clean, judge_answer, read_exception
 from service.dispatcher.pickle_guard import read_error
 from service.domain.identifiers import utc_now
-from service.domain.payload import ESTIMATES, InvalidResultError, ResultPayload, read_payload, result_payload
+from service.domain.payload import (
+    ESTIMATES,
+    InvalidResultError,
+    ResultPayload,
+    WorkPayload,
+    read_payload,
+    result_payload,
+)
 from service.domain.requests import AnalysisRequest
 from service.runtime.settings import Settings
 from service.store.artefacts import ArtefactStore
@@ -82,6 +90,7 @@ def engine_result(**changes: Any) -> RunResult:
         "agn_contrast": None,
         "surface_brightness": 20.0,
         "stages": (StageTime("forward", 1.0, 0.5), StageTime("posterior", 2.0, 2.0)),
+        "work": Work(3_000_000_000, 2_000_000, 40_000, 9, 9600),
     }
     return RunResult(**(whole | changes))
 
@@ -89,7 +98,8 @@ def engine_result(**changes: Any) -> RunResult:
 def test_a_result_without_a_chain_is_a_payload_too() -> None:
     image = [found for found in engine_result().estimates if found.estimator == "image"]
     lone = engine_result(
-        estimates=tuple(image), chain=None, ln_evidence=None, condition_number=None, aperture=None
+        estimates=tuple(image), chain=None, ln_evidence=None, condition_number=None, aperture=None,
+        work=Work(16_000_000, 3_000_000, 434),
     )  # fmt: skip
     payload = ResultPayload.model_validate_json(result_payload(lone).model_dump_json())
     assert (payload.chain, payload.ln_evidence, payload.condition_number, payload.aperture) == (None,) * 4
@@ -107,6 +117,24 @@ def test_an_engine_result_becomes_a_payload_that_survives_json() -> None:
     again = ResultPayload.model_validate_json(payload.model_dump_json())
     assert again == payload
     assert again.digest == payload.digest
+
+
+def test_what_was_computed_is_in_the_payload_whatever_its_size_and_part_of_what_was_found() -> None:
+    payload = result_payload(engine_result())
+    assert payload.work == WorkPayload(
+        pixels_rendered=3_000_000_000, rays_traced=2_000_000, columns_solved=40_000, parameters_sampled=9,
+        evidence_evaluations=9600,
+    )  # fmt: skip
+    more = result_payload(engine_result(work=Work(3_000_000_001, 2_000_000, 40_000, 9, 9600)))
+    assert more.digest != payload.digest
+    # What a worker of an older version sends is stored all the same.
+    older = payload.model_dump(mode="json", exclude={"work"})
+    assert read_payload(older).work is None
+
+
+def test_evaluations_that_are_not_those_of_the_chain_are_no_result() -> None:
+    with pytest.raises(InvalidResultError, match="9599 evaluations counted, 9600 in the chain"):
+        result_payload(engine_result(work=Work(1, 1, 1, 9, 9599)))
 
 
 def test_the_digest_is_of_what_was_found_and_not_of_how_long_it_took() -> None:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -87,9 +88,10 @@ SERVICES = {
 @pytest.mark.parametrize("starts", [4, pytest.param(40, marks=[pytest.mark.long, pytest.mark.timeout(3600)])])
 @pytest.mark.parametrize("name", SERVICES)
 def test_a_service_that_is_stopped_at_any_moment_of_its_start_ends_with_0_and_leaves_nobody(
-    name: str, starts: int, tmp_path: Path
+    name: str, starts: int, tmp_path: Path, migrated_sqlite: Path
 ) -> None:
-    subprocess.run([sys.executable, "-m", "service", "db", "upgrade"], env=environment(tmp_path, "-"), check=True)
+    (tmp_path / "data").mkdir()
+    shutil.copy(migrated_sqlite, tmp_path / "data" / "hostlens.sqlite")
     chance = random.Random(name)
     # From the first moment to well after the start, more of them early.
     delays = [0.0, *(4.0 * chance.random() ** 2 for _ in range(starts - 1))]

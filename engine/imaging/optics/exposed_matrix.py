@@ -20,7 +20,8 @@ from engine.imaging.optics.interface import Pixels
 _NODES = 8
 """Sub-pixels along each axis between which the response is interpolated: Lagrange polynomials of order 7."""
 _LEAST_TRANSFER = 0.4
-_BLOCK = 512
+_ALIKE = 1e-9
+"""Sub-pixels: positions whose fractions differ by less are those of one response, to the rounding of their sums."""
 _GUARD = 16
 """Sub-pixels of zeros round the PSF, against wrapping."""
 
@@ -84,8 +85,27 @@ def _shift(values: FloatArray, fy: float, fx: float, half_shifted: FloatArray, o
 
 
 @kernel
+def _count_near(
+    to_row: NDArray[np.int64],
+    to_column: NDArray[np.int64],
+    of_row: NDArray[np.int64],
+    of_column: NDArray[np.int64],
+    radius: int,
+) -> NDArray[np.int64]:
+    """How many of the pixels ``to`` (M,) are within ``radius`` of each pixel ``of`` (p,)."""
+    out = np.zeros(of_row.size, np.int64)
+    for p in range(of_row.size):
+        for m in range(to_row.size):
+            out[p] += abs(to_row[m] - of_row[p]) <= radius and abs(to_column[m] - of_column[p]) <= radius
+    return out
+
+
+@kernel
 def _fill_matrix(
-    out: FloatArray,
+    pointers: NDArray[np.int64],
+    rows: NDArray[np.int32],
+    values: FloatArray,
+    order: NDArray[np.int64],
     native: FloatArray,
     indptr: NDArray[np.int32],
     first_row: NDArray[np.int64],
@@ -99,8 +119,10 @@ def _fill_matrix(
     at_column: FloatArray,
     radius: int,
 ) -> None:
-    """Responses of M pixels to the light of p others, written into ``out`` (M, p), zero beyond ``radius`` pixels.
+    """Responses of M pixels to the light of p others within ``radius`` pixels, by columns.
 
+    Column p is ``pointers[p]`` to ``pointers[p + 1]`` of ``rows`` and ``values``, which are written, in the ``order``
+    (p,) in which fractions of positions that are alike follow each other: the response is shifted once for all of them.
     ``native`` (n, n) is that of a native pixel by sub-pixel offset. Pixel m takes native pixels ``indptr[m]`` to
     ``indptr[m + 1]``, whose first sub-pixels are at ``first_row`` and ``first_column`` (e,), with ``shares`` (e,).
     ``to_row``, ``to_column`` (M,), ``of_row`` and ``of_column`` (p,) are pixels of the image; ``at_row`` and
@@ -109,10 +131,14 @@ def _fill_matrix(
     size = native.shape[0]
     centre = size // 2
     half_shifted, shifted = np.empty((size, size)), np.empty((size, size))
-    for p in range(of_row.size):
+    fy, fx = -1.0, -1.0
+    for p in order:
         row, column = int(np.floor(at_row[p])), int(np.floor(at_column[p]))
-        # Offsets of the sub-pixels from the light are whole numbers less the light's fraction.
-        _shift(native, 1.0 - (at_row[p] - row), 1.0 - (at_column[p] - column), half_shifted, shifted)
+        if abs(at_row[p] - row - fy) > _ALIKE or abs(at_column[p] - column - fx) > _ALIKE:
+            fy, fx = at_row[p] - row, at_column[p] - column
+            # Offsets of the sub-pixels from the light are whole numbers less the light's fraction.
+            _shift(native, 1.0 - fy, 1.0 - fx, half_shifted, shifted)
+        at = pointers[p]
         for m in range(to_row.size):
             if abs(to_row[m] - of_row[p]) > radius or abs(to_column[m] - of_column[p]) > radius:
                 continue
@@ -121,7 +147,8 @@ def _fill_matrix(
                 a, b = first_row[e] - row + centre, first_column[e] - column + centre
                 if 0 <= a < size and 0 <= b < size:
                     total += shares[e] * shifted[a, b]
-            out[m, p] = total
+            rows[at], values[at] = m, total
+            at += 1
 
 
 def exposed_blurring_matrix(
@@ -163,25 +190,27 @@ def exposed_blurring_matrix(
     first_column = geometry.margin + shift_x[index] + factor * column
     at_row = np.asarray((of[0] - (ny - 1) / 2) * scale + (high_y - 1) / 2, dtype=np.float64)
     at_column = np.asarray((of[1] - (nx - 1) / 2) * scale + (high_x - 1) / 2, dtype=np.float64)
-    blocks = []
-    # Dense in between, a few columns at a time: all of a large image at once would need gigabytes.
-    for start in range(0, of[0].size, _BLOCK):
-        some = slice(start, start + _BLOCK)
-        block = np.zeros((to_row.size, of[0][some].size))
-        _fill_matrix(
-            block,
-            native,
-            weights.indptr.astype(np.int32),
-            first_row,
-            first_column,
-            weights.data.astype(np.float64),
-            to_row,
-            to_column,
-            of[0][some].astype(np.int64),
-            of[1][some].astype(np.int64),
-            at_row[some],
-            at_column[some],
-            radius,
-        )
-        blocks.append(sparse.csc_matrix(block))
-    return sparse.hstack(blocks, format="csr")
+    of_row, of_column = of[0].astype(np.int64), of[1].astype(np.int64)
+    near = _count_near(to_row, to_column, of_row, of_column, radius)
+    pointers = np.concatenate([[0], np.cumsum(near)])
+    rows, values = np.empty(pointers[-1], np.int32), np.empty(pointers[-1])
+    fractions = np.round([at_column - np.floor(at_column), at_row - np.floor(at_row)], 6)
+    _fill_matrix(
+        pointers,
+        rows,
+        values,
+        np.lexsort(fractions),
+        native,
+        weights.indptr.astype(np.int32),
+        first_row,
+        first_column,
+        weights.data.astype(np.float64),
+        to_row,
+        to_column,
+        of_row,
+        of_column,
+        at_row,
+        at_column,
+        radius,
+    )
+    return sparse.csc_matrix((values, rows, pointers), shape=(to_row.size, of_row.size)).tocsr()
