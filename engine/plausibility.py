@@ -8,14 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from engine.conventions import FloatArray, rate_to_magnitude
+from engine.conventions import rate_to_magnitude
 from engine.errors import ObservationError, SpecError
 from engine.imaging.calibration import LIKELY_ZERO_POINTS, require_zero_point
 from engine.imaging.external_files import MOST_PIXELS
 from engine.imaging.observation import Observation
-from engine.imaging.optics.spline import place_stamp
 from engine.imaging.psf_stamp import mended, same_picture, width
 from engine.imaging.readings import Findings
+from engine.imaging.sharpness import sharpness_of_peaks, sharpness_of_stamp
 from engine.parametric.detectability import why_no_lens
 
 _SMALLEST = 16
@@ -30,7 +30,6 @@ _SECOND_DIFFERENCES = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0])
 _SKY_WINDOW, _FAINTEST_PERCENT, _FEWEST_PIXELS = 11, 25.0, 400
 _SHARP = 1.3
 """Sharpness of an image's sharpest peak over the PSF's from which on the PSF is too broad."""
-_PEAK_SIGNIFICANCE, _HOT_PIXEL, _MOST_PEAKS, _PHASES = 60.0, 0.25, 6, 9
 
 
 def require_hints(
@@ -165,37 +164,7 @@ def _look_at_psf(observation: Observation, found: Findings) -> None:
     if pixels < 1.0:
         found.note(f"psf: is {pixels:.2f} pixels wide, narrower than one")
     _between(pixels * observation.pixel_scale, _LIKELY_WIDTHS, "psf", "arcsec wide", found, _POSSIBLE_WIDTHS)
-    sharpest = sharpest_peak(observation)
-    if sharpest is not None and sharpest > _SHARP:
-        found.note(f"psf: the image has a peak {sharpest:.1f} times as sharp: is it oversampled, or another filter's?")
-
-
-def sharpest_peak(observation: Observation) -> float | None:
-    """Sharpness of the sharpest of the brightest peaks over the most that the PSF can have; None without such a peak.
-
-    The sharpness of a pixel is what its four neighbours fall short of it, over its height above the sky. Whatever else
-    shines there makes it less, and so does a place between the pixels. A hot pixel is no peak.
-    """
-    valid, sky = observation.valid, float(np.median(observation.image[observation.valid]))
-    image = np.where(valid, observation.image - sky, 0.0)
-    significant = image > _PEAK_SIGNIFICANCE * np.where(valid, observation.noise, np.inf)
-    whole = ndimage.binary_erosion(valid, np.ones((3, 3), dtype=bool))
-    rows, columns = np.nonzero((image == ndimage.maximum_filter(image, 3)) & significant & whole)
-    sharp = []
-    for k in np.argsort(-image[rows, columns])[:_MOST_PEAKS]:
-        core = image[rows[k] - 1 : rows[k] + 2, columns[k] - 1 : columns[k] + 2]
-        if np.sort(core.ravel())[-2] > _HOT_PIXEL * core[1, 1]:
-            sharp.append(_sharpness(core))
-    return max(sharp) / _psf_sharpness(observation.psf) if sharp else None
-
-
-def _psf_sharpness(psf: FloatArray) -> float:
-    """The largest sharpness of a PSF over where it may stand in its pixel."""
-    places = np.linspace(-0.5, 0.5, _PHASES)
-    moved = [place_stamp(psf, (3, 3), 1.0 + dx, 1.0 + dy) for dx in places for dy in places]
-    return max(_sharpness(core) for core in moved if core[1, 1] == core.max())
-
-
-def _sharpness(core: FloatArray) -> float:
-    around = float(core[0, 1] + core[2, 1] + core[1, 0] + core[1, 2])
-    return 4.0 - around / float(core[1, 1])
+    peaks = sharpness_of_peaks(observation)
+    times = float(peaks[0]) / sharpness_of_stamp(psf) if peaks.size else 0.0
+    if times > _SHARP:
+        found.note(f"psf: the image has a peak {times:.1f} times as sharp: is it oversampled, or another filter's?")

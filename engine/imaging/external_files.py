@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +28,7 @@ from engine.imaging.observation import Observation
 from engine.imaging.psf_centre import PsfCentre
 from engine.imaging.psf_stamp import binned, same_picture
 from engine.imaging.readings import Findings, recorded
+from engine.imaging.sharpness import sampled_more_finely
 from engine.imaging.world import Placement, World, cutout, place, read_world
 
 MOST_PIXELS = 640
@@ -151,23 +153,33 @@ def read_external_observation(
         sigma = _noise_map(noise, science, given, found)
     else:
         sigma = _made_noise(science, given, found) if science.noise is None else science.noise
-    stamp = _psf(psf, science, psf_oversampling, found)
+    stamp, stated = _psf(psf, science, psf_oversampling, found)
     usable = [] if science.good is None else [science.good]
     roles: tuple[tuple[str | Path | None, Literal["valid", "dq"]], ...] = ((mask, "valid"), (dq, "dq"))
     usable += [_usable(path, role, science, good_bits, found) for path, role in roles if path is not None]
     files = {"image": image, "psf": psf, "noise": noise, "valid": mask, "dq": dq}
     record = {f"{role}_file": Path(path).name for role, path in files.items() if path} | recorded(found.readings)
+    observed = partial(
+        observation_from_arrays, science.values, sigma,
+        pixel_scale=science.pixel_scale, zero_point=science.calibration.zero_point,
+        recentre_psf=recentre_psf, normalise_psf=normalise_psf, mend_psf=mend_psf,
+        valid=np.logical_and.reduce(usable) if usable else None, weight=science.weight,
+        saturation=saturation_e_s, centre=science.centre, orientation=science.orientation,
+    )  # fmt: skip
     try:
-        return observation_from_arrays(
-            science.values, sigma, stamp, science.pixel_scale, science.calibration.zero_point,
-            recentre_psf=recentre_psf, normalise_psf=normalise_psf, mend_psf=mend_psf,
-            valid=np.logical_and.reduce(usable) if usable else None, weight=science.weight,
-            saturation=saturation_e_s, provenance=record, centre=science.centre, orientation=science.orientation,
-            notes=tuple(found.notes),
-        )  # fmt: skip
+        seen = observed(psf=stamp, provenance=record, notes=tuple(found.notes))
+        factor = None if stated else sampled_more_finely(seen, stamp)
+        if factor is None:
+            return seen
+        found.note(
+            f"psf: is taken for sampled {factor} times as finely as the image, whose stars are too sharp for it; "
+            "--psf-oversampling says otherwise"
+        )
+        found.read("psf_oversampling", factor, "the point sources of the image")
+        record |= recorded(found.readings)
+        return observed(psf=binned(stamp, factor), provenance=record, notes=tuple(found.notes))
     except ObservationError as error:
-        role = str(error).partition(":")[0]
-        raise ObservationError(f"{files.get(role) or image}: {error}") from error
+        raise ObservationError(f"{files.get(str(error).partition(':')[0]) or image}: {error}") from error
 
 
 def _science(
@@ -335,8 +347,11 @@ def _correlation(headers: Headers, pixel_scale: float, found: Findings) -> float
     return factor
 
 
-def _psf(path: str | Path, science: _Science, oversampling: int | None, found: Findings) -> FloatArray:
-    """The PSF's stamp on the image's pixels; the image in its place, or pixels that do not fit them, are refused."""
+def _psf(path: str | Path, science: _Science, oversampling: int | None, found: Findings) -> tuple[FloatArray, bool]:
+    """The PSF's stamp on the image's pixels, and whether anything says how finely it is sampled.
+
+    The image in its place, or pixels that do not fit the image's, are refused.
+    """
     with opened(path) as hdus:
         plane = require_plane(hdus, path, "psf")
         if max(plane.shape) > MOST_PIXELS:
@@ -366,7 +381,7 @@ def _psf(path: str | Path, science: _Science, oversampling: int | None, found: F
         if not np.isfinite(values).all():
             raise ObservationError(f"{plane.origin}: psf: not finite everywhere")
         found.read("psf_oversampling", factor, origin)
-    return binned(values, factor)
+    return binned(values, factor), stated is not None or oversampling is not None
 
 
 def _usable(

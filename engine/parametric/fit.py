@@ -36,6 +36,8 @@ from engine.spec.priors import LensParameterName, ParameterPrior
 __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametric"]
 
 GOOD_START = Acceptance()
+_DOUBTFUL = 1.5
+"""chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
 
 
 @dataclass(frozen=True)
@@ -137,17 +139,26 @@ def fit_parametric(
         observation, deflector, shear, acceptance, priors, dark_host=real_galaxy, near=centre, anywhere=real_galaxy
     )
     groups = find_starts(task, agn_images, theta_E, positions)
+    best: ParametricFit | None = None
     refusals: list[str] = []
     told = positions is not None or agn_images is not None
     for wave in (groups, [varied_starts(group) for group in groups]):
         for solution in ranked(task, [quick_fits(task, group) for group in wave]):
             try:
-                best = polished(task, solution)
-                if real_galaxy and deflector and asks_for_galaxy(best):
-                    best = with_galaxy(task, best, theta_E, agn_told=told)
-                return fit_of(task, best, fixed_index)
+                reached = polished(task, solution)
+                if real_galaxy and deflector and asks_for_galaxy(reached):
+                    reached = with_galaxy(task, reached, theta_E, agn_told=told)
+                found = fit_of(task, reached, fixed_index)
             except PosteriorError as error:
                 refusals.append(str(error))
+                continue
+            # Behind a galaxy of Gaussians every Einstein radius has been tried.
+            if found.misfit < _DOUBTFUL or found.deflector_gaussians:
+                return found
+            if best is None or found.misfit < best.misfit:
+                best = found
+    if best is not None:
+        return best
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
 
 

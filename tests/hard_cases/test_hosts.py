@@ -216,3 +216,16 @@ def test_an_image_of_a_close_pair_that_is_taken_for_one_star_is_a_poor_fit() -> 
     assert found.status == "poor_fit"
     assert any("chi2" in warning for warning in found.warnings)
     assert np.isfinite(found.host.magnitude.mean)
+
+
+@pytest.mark.long
+def test_a_fit_that_ends_in_a_false_minimum_is_begun_anew() -> None:
+    """RXJ1131 with a host of n = 4: from the first start the fit ends with q 22 deviations off, R_eff 0.23 for 0.39.
+
+    Could go wrong: chi^2 per degree of freedom is 2.6 there, which is acceptable where nothing better is found. Holds:
+    other starts are tried, and the least chi^2 is kept, 1 per degree of freedom, with the host right.
+    """
+    asked = realization("RXJ1131")
+    result = run(replace(asked, host=replace(asked.host, n=4.0), analysis=Analysis(estimators=("image",))))
+    assert result.chi2 / result.degrees_of_freedom == pytest.approx(1.0, abs=0.05)
+    assert_host_found(result)

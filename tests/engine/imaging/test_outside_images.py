@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from engine import read_external_observation
@@ -33,9 +34,13 @@ def test_an_outside_image_is_no_doubt_a_lens(shared_data: Path, name: str) -> No
     assert why_no_lens(seen) is None
     notes = (*seen.notes, *unlikely(seen))
     if kind == "real_quasar":
-        # Its PSF is sampled three times as finely as the image, which no keyword says.
-        assert [note.partition(" times as sharp")[0] for note in notes] == ["psf: the image has a peak 3.7"]
+        # Its PSF is sampled three times as finely as the image, which no keyword says: its four AGN images do.
+        assert [note.partition(" as finely")[0] for note in notes] == ["psf: is taken for sampled 3 times"]
         finer = read_external_observation(image, psf, psf_oversampling=3, normalise_psf=True, **how)  # type: ignore[arg-type]
-        assert unlikely(finer) == ()
+        np.testing.assert_allclose(finer.psf, seen.psf)
+        as_it_is = read_external_observation(image, psf, psf_oversampling=1, normalise_psf=True, **how)  # type: ignore[arg-type]
+        assert [note.partition(" times as sharp")[0] for note in unlikely(as_it_is)] == [
+            "psf: the image has a peak 3.7"
+        ]
     else:
         assert notes == ()

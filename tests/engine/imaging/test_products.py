@@ -13,6 +13,7 @@ from engine import EngineError, ObservationError, SpecError, read_external_obser
 from engine.imaging.fits import read_observation
 from engine.imaging.observation import Observation
 from engine.imaging.readings import Reading, readings
+from engine.plausibility import unlikely
 
 SIDE, SCALE, EXPOSURE = 60, 0.05, 2000.0
 PHOTFLAM, PHOTPLAM = 7.0e-20, 8045.0
@@ -391,6 +392,23 @@ def test_an_oversampled_psf_comes_to_the_pixels_of_the_image(files: Files, facto
     np.testing.assert_array_equal(files.read(psf_oversampling=factor).psf, seen.psf)
     with pytest.raises(ObservationError, match="psf_oversampling: got 0"):
         files.read(psf_oversampling=0)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 4])
+def test_stars_say_how_finely_a_psf_is_sampled_where_no_keyword_does(files: Files, factor: int) -> None:
+    stars = [gaussian(files.image.shape, row, column, 1.0) for row, column in ((24.2, 30.0), (38.0, 21.3))]
+    files.image = files.image + sum(stars) / stars[0].max() * 300.0 * files.image.std()
+    side = 41 * factor - (factor % 2 == 0)
+    files.psf = gaussian((side, side), side // 2, side // 2, 1.0 * factor)
+    seen = files.read()
+    if factor == 1:
+        assert not [reading for reading in readings(seen) if reading.name == "psf_oversampling"]
+        return
+    assert told(seen, "psf_oversampling") == Reading("psf_oversampling", factor, "the point sources of the image")
+    assert any(note.startswith(f"psf: is taken for sampled {factor} times as finely") for note in seen.notes)
+    np.testing.assert_array_equal(files.read(psf_oversampling=factor).psf, seen.psf)
+    # Whoever says that it is on the pixels of the image is believed, with a note.
+    assert any("times as sharp" in note for note in unlikely(files.read(psf_oversampling=1), trusting=True))
 
 
 def test_a_hot_pixel_and_a_pedestal_are_taken_out_of_a_psf_and_told(files: Files) -> None:
