@@ -22,7 +22,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import Connection, insert, select, text
 
 from service.api.app import create_app
-from service.domain.payload import COUNTS, ESTIMATES, QUANTITIES, estimator_and_prior
+from service.domain.payload import COUNTS, ERRORS, ESTIMATES, QUANTITIES, estimator_and_prior
 from service.runtime.settings import Settings
 from service.store.database import Database
 from service.store.migrate import upgrade
@@ -146,11 +146,12 @@ def _answers(connection: Connection, grid_id: str, runs: int, dice: np.random.Ge
                 "input_id": first + ordinal % INPUTS,
                 **dict(zip(names, values, strict=True)),
                 **dict.fromkeys(COUNTS, 1),
+                **dict.fromkeys(ERRORS, 0.01),
             }
             for ordinal, values in zip(ordinals, drawn.tolist(), strict=True)
         ]
         connection.execute(insert(estimate), rows)
-    columns = ", ".join(("run_id", "input_id", *names, *COUNTS))
+    columns = ", ".join(("run_id", "input_id", *names, *COUNTS, *ERRORS))
     mine = f"estimator = 'image' and index_prior = 'wide' and input_id between {first} and {first + INPUTS - 1}"
     for name in ESTIMATES:
         other = estimator_and_prior(name)

@@ -53,7 +53,7 @@ def compare(
         noise_level=truth.exposures.noise.level,
         noise_treatment=found.analysis.noise_treatment,
         regularisation=found.analysis.regularisation,
-        profile=found.analysis.profile,
+        profile=None if found.analysis.max_error is not None else found.analysis.profile,
         estimates=tuple(estimate_beside(estimate, scene.host, zero_point) for estimate in found.estimates),
         aperture=None if inversion is None else _aperture_beside(inversion.aperture, scene.host, zero_point),
         lens=tuple(lens_beside(parameter, scene) for parameter in found.lens),

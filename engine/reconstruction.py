@@ -15,8 +15,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from engine.conventions import FloatArray
+from engine.error_target import ROUNDS, first_settings, next_settings, not_kept
+from engine.errors import InversionError, LensEquationError
 from engine.estimators.draws import source_draw
+from engine.estimators.error_budget import with_image_budget, with_source_budget
 from engine.estimators.image import image_estimate
+from engine.estimators.numerical_error import Answer, BestState, source_shifts
 from engine.estimators.refit import refit_draws
 from engine.estimators.sersic_fit import Refit
 from engine.estimators.summaries import summarise_all
@@ -165,16 +169,18 @@ def analyse(
                 )  # fmt: skip
         if fit.error is not None:
             observation = replace(observation, psf=fit.psf)
-        inversion = _sample(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
+        inversion = _sampled(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:
         missing = [prior for prior in _priors(fixed_index) if prior not in fit.hosts]
         warnings += tuple(f"image estimator, n {prior}: no fit has a positive host" for prior in missing)
         estimates += tuple(
-            image_estimate(fit.hosts[prior], prior, observation.zero_point)
+            with_image_budget(image_estimate(fit.hosts[prior], prior, observation.zero_point), fit.shifts.get(prior))
             for prior in _priors(fixed_index)
             if prior in fit.hosts
         )
+    if analysis.max_error is not None:
+        warnings += not_kept(estimates, analysis.max_error)
     found = Reconstruction(
         observation, analysis, fit, estimates, inversion, tuple(watch.stages), warnings, tally.work()
     )  # fmt: skip
@@ -216,6 +222,28 @@ def _priors(fixed_index: float | None) -> list[IndexPrior]:
     return [prior for prior in INDEX_PRIORS if prior != "fixed" or fixed_index is not None]
 
 
+def _sampled(
+    observation: Observation,
+    fit: ParametricFit,
+    analysis: Analysis,
+    rng: np.random.Generator,
+    fixed_index: float | None,
+    watch: Stopwatch,
+) -> SampledInversion:
+    """The chain as it was asked for, or as the numerical error that was asked for needs it."""
+    if analysis.max_error is None:
+        return _sample(observation, fit, analysis, rng, fixed_index, watch)
+    settings = first_settings(analysis)
+    found = _sample(observation, fit, settings, rng, fixed_index, watch)
+    for _ in range(ROUNDS - 1):
+        following = next_settings(settings, found.estimates, analysis.max_error)
+        if following is None:
+            break
+        settings = following
+        found = _sample(observation, fit, settings, rng, fixed_index, watch)
+    return found
+
+
 def _sample(
     observation: Observation,
     fit: ParametricFit,
@@ -239,13 +267,21 @@ def _sample(
         states = chain.thinned(analysis.draws, rng)
         draws = [source_draw(target.invert(state), target.lens(state), rng) for state in states]
         flat = chain.flat()
-        best = target.invert(flat[int(np.argmax(chain.ln_posterior.ravel()))])
+        at_best = flat[int(np.argmax(chain.ln_posterior.ravel()))]
+        best = target.invert(at_best)
         image_plane, chi2 = inverted_image(observation, problem, best)
     with watch.stage("refit"):
         drawn = [name for name in analysis.estimators if name != "image"]
         refits = tuple(refit_draws(draws, drawn, fixed_index, rng))
         answers = summarise_all(draws, refits, observation.zero_point)
     warnings = list(answers.warnings)
+    shifts: dict[Answer, dict[str, FloatArray]] = {}
+    with watch.stage("errors"):
+        state = BestState(target.lens(at_best), float(at_best[-1]), best)
+        try:
+            shifts = source_shifts(observation, problem, target.source, state, analysis.psf_radius, drawn, fixed_index)
+        except (InversionError, LensEquationError) as error:
+            warnings.append(f"numerical error: not predicted, {error}")
     if chain.summary.status != "converged":
         warnings.append(
             f"chain: {chain.summary.steps} steps are {chain.summary.steps / chain.summary.tau:.0f} "
@@ -265,7 +301,10 @@ def _sample(
         image_plane=image_plane,
         source_plane=inverted_source(best, flat, target.prior.names),
         refits=refits,
-        estimates=answers.estimates,
+        estimates=tuple(
+            with_source_budget(one, shifts.get((one.estimator, one.index_prior)), chain.summary.effective_samples)
+            for one in answers.estimates
+        ),
         aperture=answers.aperture,
         warnings=tuple(warnings),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -55,6 +55,42 @@ class Quantity:
 
 
 @dataclass(frozen=True)
+class NumericalError:
+    """How far a quantity is expected to be from what a converged computation on the same data would say.
+
+    Each part is what one stage costs in accuracy, in units of the quantity: ``rendering`` of the host's light (and
+    what the search for a minimum leaves), the ``psf`` as it is cut or moved, the source ``grid``, the ``sampling`` of
+    the posterior by a chain of finite length, and the ``draws`` of it that are fitted.
+    """
+
+    rendering: float
+    psf: float
+    grid: float
+    sampling: float
+    draws: float
+
+    @property
+    def total(self) -> float:
+        """Root of the sum of their squares: the stages err on their own."""
+        return math.sqrt(sum(getattr(self, stage) ** 2 for stage in ERROR_STAGES))
+
+
+ERROR_STAGES: tuple[str, ...] = tuple(field.name for field in fields(NumericalError))
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """The numerical error of an estimate: magnitude [mag], r_eff [arcsec], n."""
+
+    magnitude: NumericalError
+    r_eff: NumericalError
+    n: NumericalError
+
+
+BUDGETED: tuple[str, ...] = tuple(field.name for field in fields(ErrorBudget))
+
+
+@dataclass(frozen=True)
 class Estimate:
     """One estimator's answer from ``draws`` fits: one to each drawn source, or the one to the image itself.
 
@@ -62,7 +98,8 @@ class Estimate:
     plane in the image frame]; ``r_eff_galfit`` is GALFIT's radius, on the major axis: r_eff / sqrt(q).
 
     ``at_bound`` counts the fits that ended at a bound of n or of r_eff, ``n_at_bound`` and ``r_eff_at_bound`` those of
-    each; ``failed`` counts those that did not succeed and are left out of the means.
+    each; ``failed`` counts those that did not succeed and are left out of the means. ``budget`` is the numerical error
+    of the means beside their statistical one, None where it could not be predicted.
     """
 
     estimator: EstimatorName
@@ -80,6 +117,7 @@ class Estimate:
     n_at_bound: int
     r_eff_at_bound: int
     failed: int
+    budget: ErrorBudget | None = None
 
 
 @dataclass(frozen=True)
@@ -188,8 +226,8 @@ class Products:
 class RunResult:
     """The outcome of one run.
 
-    ``profile`` names the analysis profile, None where the analysis was put together by hand. An estimator that could
-    not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
+    ``profile`` names the analysis profile, None where the run chose its settings (``max_error``). An estimator that
+    could not fit a single draw is not among the ``estimates``, and a warning says why; ``aperture`` is None likewise.
     ``chain``, ``ln_evidence``, ``condition_number`` and ``aperture`` are None where no estimator needed an inversion;
     ``lens``, ``chi2`` and ``degrees_of_freedom`` are then those of the parametric fit. With one,
     ``degrees_of_freedom`` are the fitted pixels less the amplitudes and the source parameters that the data determine.

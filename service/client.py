@@ -13,7 +13,7 @@ import httpx
 from pydantic import BaseModel
 
 from service.connection import AnswerError, ApiError, ClientError, Connection, RequestError, as_json, printable
-from service.domain.answers import ComparisonAnswer, ResultPage, SummaryAnswer, TrendAnswer
+from service.domain.answers import ComparisonAnswer, FrontierAnswer, ResultPage, SummaryAnswer, TrendAnswer
 from service.domain.views import (
     DryRun,
     EventPage,
@@ -195,6 +195,14 @@ class Client:
         """Two analyses of the same observations, as ``compare="estimator", left="image", right="paper"``."""
         asked = {**asked, "compare": compare, "left": left, "right": right, "group_by": _joined(group_by)}
         return self._connection.call(ComparisonAnswer, "GET", _address("/v1/comparison", grid_ids, asked))
+
+    def frontier(self, max_error: float, quantity: str = "magnitude", **asked: Filter) -> FrontierAnswer:
+        """The cheapest profile whose numerical error stays below ``max_error``, by what stored runs predict.
+
+        ``asked`` are ``estimator`` and ``index_prior``, and values of axes, as ``system="HE0435"``.
+        """
+        wanted: dict[str, Filter] = {"max_error": max_error, "quantity": quantity, **asked}
+        return self._connection.call(FrontierAnswer, "GET", _address("/v1/frontier", (), wanted))
 
     def results(self, *grid_ids: str, **asked: Filter) -> Iterator[dict[str, Any]]:
         """Each result as a flat row, over some grids or over all; ``asked`` as in :meth:`summary`.

@@ -74,7 +74,8 @@ def _first_start(draw: SourceDraw, bounds: _Bounds) -> FloatArray:
     return np.asarray(fits.shapes[int(np.argmax(np.where(fits.fluxes > 0, gain, -np.inf)))])
 
 
-def _metric(estimator: EstimatorName, draws: Sequence[SourceDraw]) -> Metric:
+def metric_of(estimator: EstimatorName, draws: Sequence[SourceDraw]) -> Metric:
+    """What an estimator minimises for each of the draws."""
     match estimator:
         case "paper":
             return PaperMetric(draws, [draw.drawn for draw in draws])
@@ -124,19 +125,19 @@ def refit_draws(
     draws: Sequence[SourceDraw],
     estimators: Sequence[EstimatorName],
     fixed_index: float | None,
-    rng: np.random.Generator,
+    rng: np.random.Generator | None,
 ) -> list[Refit]:
     """Refit draws (one at least) by every estimator that fits drawn sources.
 
     With n free, n in a wide range, and n held at ``fixed_index`` if there is one. A fit that does not converge, or
-    whose flux is not positive, is None.
+    whose flux is not positive, is None. Without ``rng`` all fits are those of least chi^2, with nothing drawn.
     """
     ranges = dict(INDEX_RANGES)
     if fixed_index is not None:
         ranges["fixed"] = (fixed_index, fixed_index)
     bounds = {prior: _Bounds.of(draws, index_range) for prior, index_range in ranges.items()}
     starts = np.repeat(_first_start(draws[0], bounds["wide"])[None], len(draws), axis=0)
-    seeds = [int(seed) for seed in rng.integers(2**63, size=len(draws))]
+    seeds = None if rng is None else [int(seed) for seed in rng.integers(2**63, size=len(draws))]
     out = []
     for estimator in estimators:
         found, wide = _refit_sources(estimator, draws, starts, bounds, seeds)
@@ -150,10 +151,10 @@ def _refit_sources(
     draws: Sequence[SourceDraw],
     starts: FloatArray,
     bounds: dict[IndexPrior, _Bounds],
-    seeds: Sequence[int],
+    seeds: Sequence[int] | None,
 ) -> tuple[list[Refit], Fits]:
     """An estimator that fits each drawn source, with every prior of n, the widest first; and its fits with that."""
-    metric, every = _metric(estimator, draws), np.arange(len(draws))
+    metric, every = metric_of(estimator, draws), np.arange(len(draws))
     out: list[Refit] = []
     first: Fits | None = None
     spread: tuple[FloatArray, FloatArray] | None = None
@@ -166,7 +167,7 @@ def _refit_sources(
         # within a narrower range need not be drawn again.
         if not (fits is first and spread is not None and inside.hold(spread[0]).all()):
             spread = fits.shapes, fits.fluxes
-            if isinstance(metric, ProjectedMetric):
+            if isinstance(metric, ProjectedMetric) and seeds is not None:
                 # Its chi^2 is that of the data: the source's own scatter is not in the draws that it sees.
                 generators = [np.random.default_rng(seed) for seed in seeds]
                 spread = scatter(metric, every, fits, inside.low, inside.high, generators)

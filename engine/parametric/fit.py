@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -21,8 +21,9 @@ from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, profile_of
 from engine.parametric.constraints import worst_miss
 from engine.parametric.galaxies import asks_for_galaxy, with_galaxy
-from engine.parametric.host_posterior import HostPosterior
+from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.parametric.model import ImageModel
+from engine.parametric.numerical_error import HostShift, host_shifts
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
@@ -36,6 +37,7 @@ from engine.spec.priors import LensParameterName, ParameterPrior
 __all__ = ["GOOD_START", "Acceptance", "ParametricFit", "fit_of", "fit_parametric"]
 
 GOOD_START = Acceptance()
+_N = COORDINATES.index("n")
 _DOUBTFUL = 1.5
 """chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
 
@@ -53,7 +55,8 @@ class ParametricFit:
     covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of
     the host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
     all and of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how
-    much, or is None, and ``psf`` (n, n) is the stamp with its correction.
+    much, or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are numerical errors of the
+    ``hosts``.
     """
 
     lens: PowerLawLens
@@ -75,6 +78,7 @@ class ParametricFit:
     sigma: FloatArray
     psf: FloatArray
     error: ModelError | None
+    shifts: Mapping[IndexPrior, HostShift] = field(default_factory=dict)
 
     @property
     def misfit(self) -> float:
@@ -214,6 +218,9 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         sigma=model.sigma if solution.noise is None else solution.noise,
         psf=model.observation.psf,
         error=solution.error,
+        shifts=host_shifts(
+            solution, jacobian, amplitudes, {prior: host.covariance[_N, _N] == 0.0 for prior, host in hosts.items()}
+        ),
     )
 
 

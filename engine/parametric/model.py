@@ -101,6 +101,8 @@ class ImageModel:
         self.pixels = int(np.count_nonzero(self.weight))
         inner = np.zeros((0, 1)) if galaxy is None else galaxy[:, window[0], window[1]].reshape(len(galaxy), -1)
         self._galaxy = inner * self.weight
+        # Of the host, what :meth:`corrected` has taken off the data.
+        self.host_defect: FloatArray = np.zeros_like(self.data)
         self._anchors: dict[int, tuple[float, float, FloatArray]] = {}
         self._deflector = lru_cache(maxsize=4)(self._render_deflector)
         self._host = lru_cache(maxsize=4)(self._render_host)
@@ -182,13 +184,14 @@ class ImageModel:
         if space.deflector:
             shape = values[space.deflector_slice]
             lit.append((profile_of(shape), None, float(amplitudes[space.n_agn]), self._deflector(*shape.tolist())[0]))
-        defect = np.zeros(self.data.size)
+        defects = []
         for profile, behind, brightness, column in lit:
             exact = self.observation.optics.sersic_image(profile, behind)[self.window]
-            defect += brightness * (exact.ravel() * self.weight - column)
+            defects.append(brightness * (exact.ravel() * self.weight - column))
         out = copy(self)
-        out._target = self._observed - defect
+        out._target = self._observed - sum(defects)
         out.data = self.decorrelated(out._target)
+        out.host_defect = defects[0]
         out._anchors = {}
         return out
 

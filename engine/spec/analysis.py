@@ -60,6 +60,9 @@ class Analysis:
     ``priors`` of the lens parameters, by name, come before those of the system. With ``agn_position_sd`` [arcsec per
     axis] the measured positions of the AGN images have to come from one point of the source plane. ``background_sd``
     [e-/s in a pixel] is how well the sky was taken off before; where None the background is free.
+    With ``max_error`` [mag] the run itself chooses walkers, length of the chain, draws and source pixels, from those of
+    `draft` up to the cost of `reference`, so that the numerical error of every magnitude (n in the wide range) stays
+    below it; draws and source pixels that are given are the least. A warning says where it does not.
     ``estimators`` are those whose answer is wanted: ``image`` alone needs neither an inversion nor a chain.
     """
 
@@ -81,6 +84,7 @@ class Analysis:
     priors: Priors = Field(default_factory=dict)
     agn_position_sd: Annotated[Number, Field(ge=1e-5, le=1.0)] | None = None
     background_sd: Annotated[Number, Field(ge=1e-9, le=1e9)] | None = None
+    max_error: Annotated[Number, Field(ge=1e-4, le=10.0)] | None = None
     estimators: Annotated[
         tuple[EstimatorName, ...], Field(min_length=1, max_length=len(ESTIMATORS)), AfterValidator(_each_once)
     ] = ESTIMATORS

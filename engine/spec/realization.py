@@ -47,7 +47,7 @@ class Realization:
         if dumped["optics"] is None:
             del dumped["optics"]
         dumped["analysis"] |= _GONE
-        for name in ("agn_position_sd", "background_sd"):
+        for name in ("agn_position_sd", "background_sd", "max_error"):
             if dumped["analysis"][name] is None:
                 del dumped["analysis"][name]
         if self.analysis.estimators == ESTIMATORS:

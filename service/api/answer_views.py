@@ -27,8 +27,8 @@ def bias_view(found: Biases, place: int) -> dict[str, Any] | None:
             "mean": six(found.pull.mean[place]),
             "scatter": six(found.pull.scatter[place]),
         },
-        "coverage": {name: _share(one, place) for name, one in found.coverage.items()},
-        "within": {f"{band:g}": _share(one, place) for band, one in found.within.items()},
+        "coverage": {name: share_view(one, place) for name, one in found.coverage.items()},
+        "within": {f"{band:g}": share_view(one, place) for band, one in found.within.items()},
     }
 
 
@@ -37,7 +37,7 @@ def difference_view(found: Differences, place: int) -> dict[str, Any]:
     is_known = math.isfinite(found.closer.fraction[place])
     return {
         **_moments(found.difference, place, "pairs"),
-        "left_closer": _share(found.closer, place) if is_known else None,
+        "left_closer": share_view(found.closer, place) if is_known else None,
     }
 
 
@@ -54,5 +54,6 @@ def _moments(found: Moments, place: int, counted: str) -> dict[str, Any]:
     }
 
 
-def _share(found: Share, place: int) -> dict[str, float | None]:
+def share_view(found: Share, place: int) -> dict[str, float | None]:
+    """A :class:`service.domain.answers.ShareView` as plain data."""
     return {"fraction": six(found.fraction[place]), "low": six(found.low[place]), "high": six(found.high[place])}

@@ -16,6 +16,7 @@ from service.api import (
     events,
     exports,
     figures,
+    frontier,
     grids,
     health,
     login,
@@ -110,7 +111,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
     figures.install(app)
-    for room in (grids, run_files, figures, results, exports, measurements, events, catalogue, health, login):
+    for room in (grids, run_files, figures, results, frontier, exports, measurements, events, catalogue, health, login):
         app.include_router(room.router)
     site.install(app)
     return app

@@ -35,9 +35,9 @@ from service.store.result_filter import AXES, NONE, FilterError, ResultFilter
 from service.store.result_rows import QUANTITY_UNITS, result_columns, result_rows
 
 router = APIRouter(prefix="/v1", tags=["answers"], route_class=Route)
-_ESTIMATORS = tuple(dict.fromkeys(estimator_and_prior(name)[0] for name in ESTIMATES))
-_PRIORS = tuple(dict.fromkeys(estimator_and_prior(name)[1] for name in ESTIMATES))
-_RECOMMENDED = estimator_and_prior(RECOMMENDED)
+ESTIMATORS = tuple(dict.fromkeys(estimator_and_prior(name)[0] for name in ESTIMATES))
+PRIORS = tuple(dict.fromkeys(estimator_and_prior(name)[1] for name in ESTIMATES))
+RECOMMENDED_PARTS = estimator_and_prior(RECOMMENDED)
 _Text = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00]*$")]
 _Values = Annotated[list[_Text], Field(max_length=1000)]
 _CONFIG = ConfigDict(extra="forbid")
@@ -58,8 +58,8 @@ class AnswerQuery(FilterBody):
     """Which results, which quantity, by which estimator."""
 
     quantity: Literal[QUANTITIES] = "magnitude"  # type: ignore[valid-type]
-    estimator: Literal[_ESTIMATORS] = _RECOMMENDED[0]  # type: ignore[valid-type]
-    index_prior: Literal[_PRIORS] = _RECOMMENDED[1]  # type: ignore[valid-type]
+    estimator: Literal[ESTIMATORS] = RECOMMENDED_PARTS[0]  # type: ignore[valid-type]
+    index_prior: Literal[PRIORS] = RECOMMENDED_PARTS[1]  # type: ignore[valid-type]
     group_by: str = Field(default="", max_length=200, description=f"Comma-separated, of {', '.join(AXES)}")
 
 
@@ -89,8 +89,8 @@ class ComparisonQuery(AnswerQuery):
 class RowsQuery(FilterBody):
     """Which results, with the answers of which estimator."""
 
-    estimator: Literal[(*_ESTIMATORS, "all")] = _RECOMMENDED[0]  # type: ignore[valid-type]
-    index_prior: Literal[_PRIORS] = _RECOMMENDED[1]  # type: ignore[valid-type]
+    estimator: Literal[(*ESTIMATORS, "all")] = RECOMMENDED_PARTS[0]  # type: ignore[valid-type]
+    index_prior: Literal[PRIORS] = RECOMMENDED_PARTS[1]  # type: ignore[valid-type]
 
 
 class ResultQuery(RowsQuery):
@@ -280,7 +280,7 @@ def _asked(query: AnswerQuery, axes: tuple[str, ...]) -> dict[str, Any]:
         "unit": QUANTITY_UNITS[query.quantity],
         "estimator": query.estimator,
         "index_prior": query.index_prior,
-        "recommended": (query.estimator, query.index_prior) == _RECOMMENDED,
+        "recommended": (query.estimator, query.index_prior) == RECOMMENDED_PARTS,
         "group_by": list(axes),
         "filter": given_filter(query),
     }
@@ -289,7 +289,7 @@ def _asked(query: AnswerQuery, axes: tuple[str, ...]) -> dict[str, Any]:
 def _side(query: ComparisonQuery, name: str) -> str | None:
     """A value of the analysis that is compared; None is the value that is not there."""
     value: str = getattr(query, name)
-    allowed = {"estimator": _ESTIMATORS, "index_prior": _PRIORS}.get(query.compare)
+    allowed = {"estimator": ESTIMATORS, "index_prior": PRIORS}.get(query.compare)
     if allowed is not None and value not in allowed:
         raise InvalidRequestError("query", name, f"{name}: got {value!r}, allowed is one of {', '.join(allowed)}")
     if query.compare in AXES and getattr(query, query.compare):

@@ -16,6 +16,7 @@ from service.cli import grids, pictures
 from service.cli.connection import FailedError, console
 from service.cli.connection import settings as _settings
 from service.cli.figures import figures
+from service.cli.frontier import frontier
 from service.cli.measuring import measure
 from service.cli.replay import replay
 from service.cli.tokens import tokens
@@ -65,7 +66,7 @@ app = typer.Typer(
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, figures, measure, replay):
+for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, measure, replay):
     app.command()(command)
 
 

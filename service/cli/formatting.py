@@ -113,7 +113,7 @@ def dry_run_lines(found: DryRun) -> list[str]:
 def _cost_lines(cost: Cost) -> list[str]:
     """What they should take, or of which kind too few runs are stored to say so."""
     if cost.cpu_s is None:
-        kinds = [f"{kind.camera}, {kind.configuration}, {kind.profile}" for kind in cost.unknown]
+        kinds = [f"{kind.camera}, {kind.configuration}, {kind.profile or 'max_error'}" for kind in cost.unknown]
         more = [f"and {len(kinds) - _SHOWN_KINDS} more"] if len(kinds) > _SHOWN_KINDS else []
         told = "; ".join(kinds[:_SHOWN_KINDS] + more)
         return [f"cost not known: fewer than five stored runs of {told}"]

@@ -136,7 +136,7 @@ def results(
     token: Token = None,
 ) -> None:
     """Biases by group, and whether the stated errors hold."""
-    asked: dict[str, Any] = {**_filters(where), "quantity": quantity}
+    asked: dict[str, Any] = {**filters(where), "quantity": quantity}
     asked |= {"estimator": estimator} if estimator else {}
     asked |= {"index_prior": index_prior} if index_prior else {}
     with connected(url, token) as client:
@@ -205,7 +205,7 @@ def retry(
     token: Token = None,
 ) -> None:
     """Queue again what ended without a result, or some of it."""
-    only = _filters(where)
+    only = filters(where)
     if failed:
         if "state" in only:
             raise typer.BadParameter("--failed: there is a state in --where as well")
@@ -263,7 +263,8 @@ def _change(request: dict[str, Any], part: str, given: dict[str, Any]) -> None:
         request[part] = {**(before if isinstance(before, dict) else {}), **given}
 
 
-def _filters(where: list[str] | None) -> dict[str, Any]:
+def filters(where: list[str] | None) -> dict[str, Any]:
+    """Values by axis, of AXIS=VALUE."""
     found: dict[str, Any] = {}
     for text in where or []:
         name, value = _pair("--where", text)

@@ -152,3 +152,45 @@ class ResultPage(_Answer):
     columns: dict[str, dict[str, str | None]]
     items: list[dict[str, Any]]
     next: str | None
+
+
+class ProfileErrorView(_Answer):
+    """What stored runs of one profile predict of their numerical error, and what they took."""
+
+    profile: str
+    stored: int
+    """With an answer of the estimator; the newest 20,000 are looked at."""
+    with_error: int
+    """Of which so many have a predicted error: the others are older, or it could not be predicted."""
+    kept: bool
+    """Whether ``kept_by`` of them predict no more than ``max_error``."""
+    keeps: ShareView | None
+    """How many do."""
+    median_error: float | None
+    p95_error: float | None
+    cpu_s: float | None
+    """Expected of a run: the mean over those with a predicted error."""
+    cpu_s_scatter: float | None
+    run_ids: list[str]
+    """The newest of them, ten at most."""
+    links: dict[str, str]
+
+
+class FrontierAnswer(_Answer):
+    """The cheapest profile that keeps a numerical error, by what stored runs predict of themselves."""
+
+    quantity: str
+    unit: str | None
+    max_error: float
+    estimator: str
+    index_prior: str
+    filter: dict[str, list[str]]
+    kept_by: float
+    """Part of the stored runs of a profile that must predict no more for the profile to keep the error."""
+    cheapest: str | None
+    told: str
+    """The same in words; where no stored run tells, that."""
+    profiles: list[ProfileErrorView]
+    """The cheapest first."""
+    to_know: list[dict[str, Any]]
+    """Bodies of POST /v1/grids for the profiles of which fewer than 30 stored runs tell."""

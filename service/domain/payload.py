@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -35,6 +37,15 @@ RECOMMENDED: EstimateName = "image_wide"
 """The estimate to quote where nobody asks for another."""
 QUANTITIES = ("magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y")
 COUNTS = ("draws", "at_bound", "n_at_bound", "r_eff_at_bound", "failed")
+BUDGETED = ("magnitude", "r_eff", "n")
+ERROR_STAGES = ("rendering", "psf", "grid", "sampling", "draws")
+"""Quantities whose numerical error is predicted, and the stages that it is told by."""
+ERROR_PARTS = tuple(
+    (quantity, f"{quantity}_error", tuple((stage, f"{quantity}_error_{stage}") for stage in ERROR_STAGES))
+    for quantity in BUDGETED
+)
+"""Of each quantity the column of the whole error, and those of its stages."""
+ERRORS = tuple(name for _, whole, stages in ERROR_PARTS for name in (whole, *(column for _, column in stages)))
 _OF_CHAIN = ("ln_evidence", "chi2", "degrees_of_freedom", "condition_number")
 """What a result has if it has a chain."""
 WORK = ("pixels_rendered", "rays_traced", "columns_solved", "parameters_sampled")
@@ -72,6 +83,29 @@ class QuantityPayload(_Strict):
         return None if self.truth is None else self.mean - self.truth
 
 
+class NumericalErrorPayload(_Strict):
+    """Predicted distance of a quantity from a converged computation on the same data, by stage."""
+
+    rendering: NonNegative
+    psf: NonNegative
+    grid: NonNegative
+    sampling: NonNegative
+    draws: NonNegative
+
+    @property
+    def total(self) -> float:
+        """Root of the sum of their squares."""
+        return math.hypot(self.rendering, self.psf, self.grid, self.sampling, self.draws)
+
+
+class ErrorBudgetPayload(_Strict):
+    """Numerical errors of magnitude, r_eff [arcsec] and n."""
+
+    magnitude: NumericalErrorPayload
+    r_eff: NumericalErrorPayload
+    n: NumericalErrorPayload
+
+
 class EstimatePayload(_Strict):
     """What one estimator recovered: magnitude [AB], r_eff and GALFIT's [arcsec], n, q, position angle [deg], centre."""
 
@@ -88,6 +122,7 @@ class EstimatePayload(_Strict):
     n_at_bound: Annotated[int, Field(ge=0)]
     r_eff_at_bound: Annotated[int, Field(ge=0)]
     failed: Annotated[int, Field(ge=0)]
+    budget: ErrorBudgetPayload | None = None
 
 
 class AperturePayload(_Strict):
@@ -306,7 +341,8 @@ def _read(kind: type[_PayloadT], document: object) -> _PayloadT:
 
 def _estimate(estimate: Estimate) -> dict[str, Any]:
     quantities = {name: _quantity(getattr(estimate, name)) for name in QUANTITIES}
-    return {**quantities, **{name: int(getattr(estimate, name)) for name in COUNTS}}
+    counts = {name: int(getattr(estimate, name)) for name in COUNTS}
+    return {**quantities, **counts, "budget": None if estimate.budget is None else asdict(estimate.budget)}
 
 
 def _aperture(aperture: Aperture) -> dict[str, Any]:

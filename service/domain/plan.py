@@ -15,7 +15,7 @@ class Kind(NamedTuple):
 
     camera: str
     configuration: str
-    profile: str
+    profile: str | None
 
 
 @dataclass(frozen=True)

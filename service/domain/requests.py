@@ -230,7 +230,7 @@ def _kind(realization: Realization) -> Kind:
     return Kind(
         camera=camera if isinstance(camera, str) else camera.name,
         configuration=CONFIGURATIONS.get(len(lens.agn), "other"),
-        profile=realization.analysis.profile,
+        profile=None if realization.analysis.max_error is not None else realization.analysis.profile,
     )
 
 

@@ -153,7 +153,8 @@ class CostKind(_Answer):
 
     camera: str
     configuration: str
-    profile: str
+    profile: str | None
+    """Null where runs choose their settings (``max_error``)."""
 
 
 class Cost(_Answer):
@@ -239,6 +240,31 @@ class Recovered(_Answer):
     bias: float | None
 
 
+class NumericalErrorView(_Answer):
+    """Predicted distance of a quantity from what a converged computation on the same data would say."""
+
+    total: float
+    """Root of the sum of the squares of what follows."""
+    rendering: float
+    """Of the host's light, and what the search for a minimum leaves."""
+    psf: float
+    """As it is cut or moved."""
+    grid: float
+    """Of the source."""
+    sampling: float
+    """Of the posterior by a chain of finite length."""
+    draws: float
+    """Of the posterior that were fitted."""
+
+
+class ErrorBudgetView(_Answer):
+    """Numerical errors of magnitude [mag], r_eff [arcsec] and n."""
+
+    magnitude: NumericalErrorView
+    r_eff: NumericalErrorView
+    n: NumericalErrorView
+
+
 class EstimateView(_Answer):
     """What one estimator recovered in one run."""
 
@@ -259,6 +285,8 @@ class EstimateView(_Answer):
     n_at_bound: int | None
     r_eff_at_bound: int | None
     failed: int
+    budget: ErrorBudgetView | None
+    """Beside the statistical error; null in older results, and where it could not be predicted."""
 
 
 class ApertureView(_Answer):

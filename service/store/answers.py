@@ -14,7 +14,7 @@ from sqlalchemy import ColumnElement, Connection, Select, and_, func, literal_co
 
 from service.domain.states import RunState
 from service.store.numbers import read_numbers
-from service.store.result_filter import AXES, ResultFilter, axes_of_run
+from service.store.result_filter import AXES, ResultFilter, axes_of_run, profile_of_spec
 from service.store.statistics import FloatArray, IntArray, Moments, Share, moments, share
 from service.store.tables import estimate, grid, input_group, result, run
 
@@ -162,7 +162,7 @@ def failures_by_group(connection: Connection, where: ResultFilter, groups: Group
         select(
             run.c.grid_id,
             run.c.inputs,
-            analysis["profile"].as_string(),
+            profile_of_spec(),
             analysis["regularisation"].as_string(),
             grid.c.engine_digest,
         )

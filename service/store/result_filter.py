@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Column, ColumnElement, Select, and_, or_, select
+from sqlalchemy import Column, ColumnElement, Select, and_, case, or_, select
 
-from service.store.tables import input_group
+from service.store.tables import input_group, run
 
 NONE = "none"
 """How a value that is not there is written, in a filter and in an answer's link."""
@@ -95,6 +95,12 @@ class ResultFilter:
     def accepts(self, values: Mapping[str, Any]) -> bool:
         """Whether something with these values by axis is meant; the same as the conditions, for what has no row."""
         return all(any(_is(values[name], one) for one in wanted) for name, wanted in self.wanted.items())
+
+
+def profile_of_spec() -> ColumnElement[str | None]:
+    """The profile of a run by its specification: none where the run is to choose its settings, as in its result."""
+    analysis = run.c.spec["analysis"]
+    return case((analysis["max_error"].as_string().is_not(None), None), else_=analysis["profile"].as_string())
 
 
 def axes_of_run(

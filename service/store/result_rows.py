@@ -10,7 +10,15 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Select, and_, select
 from sqlalchemy.sql.selectable import FromClause
 
-from service.domain.payload import COUNTS, ESTIMATES, LENS_PARAMETERS, QUANTITIES, EstimateName, estimator_and_prior
+from service.domain.payload import (
+    COUNTS,
+    ERROR_PARTS,
+    ESTIMATES,
+    LENS_PARAMETERS,
+    QUANTITIES,
+    EstimateName,
+    estimator_and_prior,
+)
 from service.store.result_filter import ResultFilter
 from service.store.tables import estimate, result, run
 
@@ -146,6 +154,14 @@ def result_columns(estimates: Sequence[EstimateName]) -> tuple[ResultColumn, ...
         columns += [
             ResultColumn(prefix + part, int, f"{_COUNT_NAMES[part]}, {name}", None, table.c[part]) for part in COUNTS
         ]
+        for quantity, whole, stages in ERROR_PARTS:
+            unit = "mag" if quantity == "magnitude" else QUANTITY_UNITS[quantity]
+            told = f"predicted numerical error of {_QUANTITY_NAMES[quantity]} by {name}"
+            columns.append(ResultColumn(prefix + whole, float, told, unit, table.c[whole]))
+            columns += [
+                ResultColumn(prefix + column, float, f"{told}: {stage}", unit, table.c[column])
+                for stage, column in stages
+            ]
     return (*columns, *(_column(*measure) for measure in _MEASURES))
 
 

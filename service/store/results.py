@@ -10,12 +10,15 @@ from typing import Any
 
 from service.domain.payload import (
     COUNTS,
+    ERROR_PARTS,
+    ERRORS,
     ESTIMATES,
     LENS_PARAMETERS,
     QUANTITIES,
     WORK,
     AperturePayload,
     ChainPayload,
+    ErrorBudgetPayload,
     MeasurementPayload,
     ResultPayload,
     estimator_and_prior,
@@ -29,6 +32,7 @@ _PLAIN = (
     "arc_magnitude", "agn_contrast", "surface_brightness",
 )  # fmt: skip
 _TOLD = ("wall_s", "cpu_s", "engine_digest", "noise_treatment", "regularisation", "profile")
+_NO_ERRORS: dict[str, float | None] = dict.fromkeys(ERRORS)
 _PARTS = tuple((quantity, *(f"{quantity}_{part}" for part in ("mean", "sd", "bias"))) for quantity in QUANTITIES)
 
 
@@ -91,8 +95,21 @@ def estimate_rows(run_id: str, input_id: int, payload: ResultPayload) -> list[di
             row[mean], row[sd], row[bias] = value.mean, value.sd, value.bias
         for part in COUNTS:
             row[part] = getattr(found, part)
-        rows.append(row)
+        rows.append(row | error_columns(found.budget))
     return rows
+
+
+def error_columns(budget: ErrorBudgetPayload | None) -> dict[str, float | None]:
+    """Columns of a budget of errors, all null without one."""
+    if budget is None:
+        return dict(_NO_ERRORS)
+    row: dict[str, float | None] = {}
+    for quantity, whole, stages in ERROR_PARTS:
+        found = getattr(budget, quantity)
+        row[whole] = found.total
+        for stage, column in stages:
+            row[column] = getattr(found, stage)
+    return row
 
 
 def measurement_row(lease: Lease, payload: MeasurementPayload, now: datetime) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from sqlalchemy import Row, RowMapping
 
 from service.domain.payload import (
     COUNTS,
+    ERROR_PARTS,
+    ERRORS,
     ESTIMATES,
     LENS_PARAMETERS,
     QUANTITIES,
@@ -39,6 +41,7 @@ ESTIMATE_COLUMNS = (
     estimate.c.index_prior,
     *(estimate.c[f"{quantity}_{part}"] for quantity in QUANTITIES for part in ("mean", "sd", "bias")),
     *(estimate.c[part] for part in COUNTS),
+    *(estimate.c[name] for name in ERRORS),
 )
 _ESTIMATES = {name: estimator_and_prior(name) for name in ESTIMATES}
 _LENS = {name: tuple(f"lens_{name.lower()}_{part}" for part in ("mean", "sd", "truth")) for name in LENS_PARAMETERS}
@@ -170,6 +173,13 @@ def _estimate(row: Row[Any]) -> dict[str, Any]:
         found[quantity] = None if mean is None else {"mean": mean, "sd": sd, "bias": bias}
     for part in COUNTS:
         found[part] = next(values)
+    errors = {name: next(values) for name in ERRORS}
+    found["budget"] = None
+    if errors["magnitude_error"] is not None:
+        found["budget"] = {
+            quantity: {"total": errors[whole], **{stage: errors[column] for stage, column in stages}}
+            for quantity, whole, stages in ERROR_PARTS
+        }
     return found
 
 

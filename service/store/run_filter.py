@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from sqlalchemy import Connection, select
 
 from service.domain.states import RunState
-from service.store.result_filter import ResultFilter, axes_of_run
+from service.store.result_filter import ResultFilter, axes_of_run, profile_of_spec
 from service.store.tables import grid, run
 
 _AT_ONCE = 1000
@@ -33,7 +33,7 @@ class RunFilter:
             select(
                 run.c.id,
                 run.c.inputs,
-                analysis["profile"].as_string().label("profile"),
+                profile_of_spec().label("profile"),
                 analysis["regularisation"].as_string().label("regularisation"),
                 grid.c.engine_digest,
             )

@@ -28,7 +28,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.domain.payload import COUNTS, LENS_PARAMETERS, QUANTITIES, WORK
+from service.domain.payload import COUNTS, ERRORS, LENS_PARAMETERS, QUANTITIES, WORK
 
 REVISION = "0011"
 """Revision of the migrations that these tables are."""
@@ -326,6 +326,8 @@ estimate = Table(
     Column("input_id", ForeignKey("input.id"), nullable=False),
     *_quantity_columns(),
     *(Column(part, Integer) for part in COUNTS),
+    # Null in results that are older than these columns, and where the error could not be predicted.
+    *(Column(name, Float) for name in ERRORS),
     # Answers over many runs of one estimator are read from here alone, without the table.
     Index(
         "ix_estimate_answer",

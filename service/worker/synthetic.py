@@ -54,6 +54,16 @@ def payload_of(realization: Realization) -> dict[str, Any]:
             "n_at_bound": 2,
             "r_eff_at_bound": 1,
             "failed": 0,
+            "budget": {
+                name: {
+                    "rendering": 1e-5 * sd,
+                    "psf": 1e-6 * sd,
+                    "grid": 0.1 * sd,
+                    "sampling": 0.07 * sd,
+                    "draws": 0.17 * sd,
+                }
+                for name, sd in (("magnitude", 0.1), ("r_eff", 0.03), ("n", 0.3))
+            },
         }
 
     return {

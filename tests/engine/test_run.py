@@ -22,7 +22,7 @@ from engine import (
 )
 from engine.figures import run_figure
 from engine.parametric.fit import ParametricFit
-from engine.result import INDEX_PRIORS
+from engine.result import BUDGETED, ERROR_STAGES, INDEX_PRIORS
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import ESTIMATORS
 from tests.engine.conftest import HELD_INDEX, cut
@@ -211,3 +211,27 @@ def test_the_noise_of_an_image_does_not_depend_on_how_it_is_analysed(realization
     other = simulate_realization(replace(realization, seed=realization.seed + 1))
     assert np.array_equal(here.observation.image, there.observation.image)
     assert not np.array_equal(here.observation.image, other.observation.image)
+
+
+def test_each_estimate_carries_its_numerical_error_by_stage(result: RunResult) -> None:
+    assert result.chain is not None
+    for estimate in result.estimates:
+        assert estimate.budget is not None
+        for name in BUDGETED:
+            parts = getattr(estimate.budget, name)
+            stages = [getattr(parts, stage) for stage in ERROR_STAGES]
+            assert all(math.isfinite(stage) and stage >= 0.0 for stage in stages)
+            assert parts.total == pytest.approx(math.hypot(*stages))
+            if estimate.estimator == "image":
+                assert (parts.grid, parts.sampling, parts.draws) == (0.0, 0.0, 0.0)
+                continue
+            # The mean of k draws, whatever the chain's share of its variance is: k is below N here.
+            fitted, samples = estimate.draws - estimate.failed, result.chain.effective_samples
+            spread = getattr(estimate, name).sd
+            assert parts.sampling == pytest.approx(spread / math.sqrt(samples))
+            assert math.hypot(parts.sampling, parts.draws) == pytest.approx(spread / math.sqrt(min(fitted, samples)))
+    # n is held: nothing moves it, while the map of a coarse grid moves the magnitude.
+    held = result.estimate("paper", "fixed").budget
+    assert held is not None
+    assert held.n.total == 0.0
+    assert held.magnitude.grid > 1e-4

@@ -119,8 +119,9 @@ def test_a_chain_counts_its_dimensions_and_evaluations_on_top_of_the_fit(
     chain = found.inversion.chain.summary
     assert found.work.parameters_sampled == len(found.lens) == 7
     assert found.work.evidence_evaluations == chain.evaluations
-    # Source pixels of each evaluation, of each draw and of the best, and six amplitudes.
-    assert found.work.columns_solved == (chain.evaluations + QUICK.draws + 1) * 144 + 6
+    # Source pixels of each evaluation, of each draw and of the best, six amplitudes, and the grid of 17 x 17 nodes that
+    # the error of the 12 x 12 is told by.
+    assert found.work.columns_solved == (chain.evaluations + QUICK.draws + 1) * 144 + 6 + 17**2
 
 
 def test_a_measurement_counts_its_fit_and_an_inversion_that_failed(

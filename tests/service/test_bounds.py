@@ -42,7 +42,7 @@ WHOLE: dict[str, Any] = {
         "noise_treatment": "diagonal", "mask_inner": 0.4, "mask_outer": 1.6,
         "core_radius": 0.2, "subrays": 2, "source_envelope": True, "ray_margin": 4, "psf_radius": 15, "walkers": 8,
         "chain_length": 100.0, "max_steps": 600, "draws": 30, "agn_position_sd": 0.01, "background_sd": 0.1,
-        "priors": {"slope": {"low": 1.5, "high": 2.5, "mean": 2.0, "sd": 0.1}},
+        "max_error": 0.02, "priors": {"slope": {"low": 1.5, "high": 2.5, "mean": 2.0, "sd": 0.1}},
     },
 }  # fmt: skip
 SCHEMA = GridRequest.model_json_schema()

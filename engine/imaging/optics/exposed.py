@@ -22,7 +22,7 @@ from engine.imaging.geometry import Geometry
 from engine.imaging.optics.exposed_matrix import exposed_blurring_matrix
 from engine.imaging.optics.interface import Pixels
 from engine.lensing.power_law import PowerLawLens
-from engine.light.rendering import render_sersic
+from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic
 from engine.light.sersic import SersicProfile
 
 _AGN_ERROR = 0.002
@@ -48,13 +48,19 @@ class ExposedOptics:
 
     def point_source(self, x: float, y: float) -> FloatArray:
         """Drizzled image (ny, nx) of a point source of unit flux at (x, y) [arcsec, image frame]."""
-        star = point_source_image(np.array([[x, y]]), np.ones(1), self.psf, self.geometry)
-        return self._drizzled(star)
+        return self.point_sources(np.array([[x, y]]), np.ones(1))
 
-    def sersic_image(self, profile: SersicProfile, lens: PowerLawLens | None = None) -> FloatArray:
+    def point_sources(self, places: FloatArray, fluxes: FloatArray) -> FloatArray:
+        """Drizzled image (ny, nx) [e-/s] of point sources: places (k, 2) [arcsec, image frame], fluxes (k,)."""
+        stars = point_source_image(places, fluxes, self.psf, self.geometry)
+        return self._drizzled(stars)
+
+    def sersic_image(
+        self, profile: SersicProfile, lens: PowerLawLens | None = None, tolerance: float = DEFAULT_TOLERANCE
+    ) -> FloatArray:
         """Drizzled image (ny, nx) [e-/s per pixel] of a Sersic profile, behind a lens or not."""
         geometry = self.geometry
-        light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens)
+        light = render_sersic(profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, lens, tolerance)
         cusps = cusp_positions(profile, lens, geometry)
         blurred = convolve(place_cusps(light, profile, cusps, geometry, lens), self.psf)
         return self._drizzled(blurred)

@@ -10,6 +10,7 @@ from scipy import sparse
 
 from engine.conventions import FloatArray
 from engine.lensing.power_law import PowerLawLens
+from engine.light.rendering import DEFAULT_TOLERANCE
 from engine.light.sersic import SersicProfile
 
 Pixels = tuple[NDArray[np.intp], ...]
@@ -50,8 +51,17 @@ class ImageOptics(Protocol):
         """Image of a point source of unit flux at (x, y) [arcsec, image frame]."""
         ...
 
-    def sersic_image(self, profile: SersicProfile, lens: PowerLawLens | None = None) -> FloatArray:
-        """Image [e-/s per pixel] of a Sersic profile, behind a lens or not: the yardstick for quicker ways."""
+    def point_sources(self, places: FloatArray, fluxes: FloatArray) -> FloatArray:
+        """Image of several: places (k, 2) [arcsec, image frame] and fluxes (k,) [e-/s]."""
+        ...
+
+    def sersic_image(
+        self, profile: SersicProfile, lens: PowerLawLens | None = None, tolerance: float = DEFAULT_TOLERANCE
+    ) -> FloatArray:
+        """Image [e-/s per pixel] of a Sersic profile, behind a lens or not: the yardstick for quicker ways.
+
+        Its light is integrated to ``tolerance`` (:func:`~engine.light.rendering.render_sersic`).
+        """
         ...
 
     def blurring_matrix(self, to: Pixels, of: Pixels, subrays: int | None, radius: int) -> sparse.csr_matrix:

@@ -18,7 +18,7 @@ from engine.imaging.optics.spline import place_stamp, spline_coefficients
 from engine.imaging.optics.stamp_blur import StampBlur
 from engine.imaging.optics.stamp_matrix import blurring_matrix, central_stamp, pixel_kernel
 from engine.lensing.power_law import PowerLawLens
-from engine.light.rendering import render_sersic
+from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic
 from engine.light.sersic import SersicProfile
 
 _OVERSAMPLING = 5
@@ -63,12 +63,21 @@ class StampOptics:
         column, row = x / self.pixel_scale + (nx - 1) / 2.0, y / self.pixel_scale + (ny - 1) / 2.0
         return place_stamp(self.psf, self.shape, column, row)
 
-    def sersic_image(self, profile: SersicProfile, lens: PowerLawLens | None = None) -> FloatArray:
+    def point_sources(self, places: FloatArray, fluxes: FloatArray) -> FloatArray:
+        """The stamp moved to places (k, 2) [arcsec, image frame], times fluxes (k,): shape (ny, nx)."""
+        image = np.zeros(self.shape)
+        for (x, y), flux in zip(places, fluxes, strict=True):
+            image += flux * self.point_source(float(x), float(y))
+        return image
+
+    def sersic_image(
+        self, profile: SersicProfile, lens: PowerLawLens | None = None, tolerance: float = DEFAULT_TOLERANCE
+    ) -> FloatArray:
         """Image (ny, nx) [e-/s per pixel] of a Sersic profile, behind a lens or not, through the stamp."""
         ny, nx = self.shape
         axes = pixel_centres(nx, self.pixel_scale), pixel_centres(ny, self.pixel_scale)
         blur = StampBlur(spline_coefficients(self.psf), *axes, self.pixel_scale, _OVERSAMPLING, _OUTSIDE)
-        return blur(render_sersic(profile, blur.x, blur.y, blur.side, lens), integrated=True)
+        return blur(render_sersic(profile, blur.x, blur.y, blur.side, lens, tolerance), integrated=True)
 
     def blurring_matrix(self, to: Pixels, of: Pixels, subrays: int | None, radius: int) -> sparse.csr_matrix:
         """B (len(to), len(of)): the same stamp for all pixels."""

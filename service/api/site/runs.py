@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request, Response
 
 from service.api.context import RunId, Service
 from service.api.threads import Route
-from service.domain.payload import ESTIMATES, RECOMMENDED
+from service.domain.payload import ERROR_STAGES, ESTIMATES, RECOMMENDED
 from service.web.rendering import page
 
 router = APIRouter(include_in_schema=False, route_class=Route)
@@ -43,6 +43,8 @@ def one_run(request: Request, run_id: RunId, service: Service) -> Response:
         grid_name=grid.name or grid.id,
         figure=f"/v1/runs/{run_id}/figure" if result is not None and result["figure"] else None,
         estimates=[(name, found[name]) for name in names if found.get(name)],
+        budgets=[(name, found[name]["budget"]) for name in names if found.get(name) and found[name]["budget"]],
+        error_stages=ERROR_STAGES,
         recommended=RECOMMENDED,
         provenance=provenance,
         downloads=_downloads(run_id, result),
