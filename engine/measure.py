@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,9 @@ from engine.errors import InversionError, ObservationError, PosteriorError, Spec
 from engine.estimators.image import image_estimate
 from engine.imaging.observation import Observation
 from engine.imaging.readings import readings
+from engine.neighbours import without_lone_pixels, without_neighbours
 from engine.on_sky import lens_on_sky, orientation_document, places_on_sky, turned
+from engine.parametric.constraints import GALAXY, WIDE
 from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
@@ -28,9 +30,9 @@ from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_f
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
+from engine.status import MeasurementStatus, arc_misfit, magnitude_limit, prior_dominated, status_of
 from engine.work import Work, counted
 
-MeasurementStatus = Literal["ok", "poor_fit"]
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
 """What is shown with the status ``poor_fit`` rather than refused: no model of a real lens is perfect."""
 _NAMES = {"image": "parametric"}
@@ -68,9 +70,10 @@ class ImageMeasurement:
     ``host`` is the parametric fit's, the first of ``estimates``; ``lens`` belongs to it. ``chi2_per_dof`` is that of
     the parametric model with the noise map times ``noise_scale``, the scatter of the residuals outside the lens in
     units of the map: a drizzled image has less noise in a pixel than its map says where the map allows for what
-    neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is ``poor_fit`` where chi2_per_dof
-    exceeds :data:`POOR_FIT`. ``inversion`` is None where none was asked for, or where it failed, which ``warnings``
-    then say. ``work`` counts all that was computed, that of an inversion that failed included.
+    neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is that of
+    :func:`~engine.status.status_of`; a host that is not detected is fainter than ``host_limit`` (95 %). ``inversion``
+    is None where none was asked for, or where it failed, which ``warnings`` then say. ``work`` counts all that was
+    computed, that of an inversion that failed included.
     """
 
     host: Estimate
@@ -78,6 +81,7 @@ class ImageMeasurement:
     lens: dict[str, Quantity]
     lens_by_inversion: dict[str, Quantity] | None
     agn: tuple[AgnPosition, ...]
+    host_limit: float | None
     arc_magnitude: float
     chi2_per_dof: float
     chi2_per_dof_as_given: float
@@ -113,6 +117,11 @@ class ImageMeasurement:
             chi2 = _chi2(self.observation, self.fit, residual, self.noise_scale)
         return chi2 / self.inversion.degrees_of_freedom
 
+    @property
+    def priors(self) -> dict[str, float]:
+        """Of the lens in the parametric fit; its ellipticity is about none, or about that of Gaussians."""
+        return (GALAXY if self.fit.deflector_gaussians else WIDE).told
+
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form, without the arrays."""
         fit, chain = self.fit, None if self.inversion is None else self.inversion.chain.summary
@@ -120,6 +129,7 @@ class ImageMeasurement:
             "status": self.status,
             "estimator": self.estimator,
             "host": _host_document(self.host),
+            "host_limit": self.host_limit,
             "lens": {name: _document(value) for name, value in self.lens.items()},
             "chi2_per_dof": self.chi2_per_dof,
             "chi2_per_dof_as_given": self.chi2_per_dof_as_given,
@@ -137,7 +147,11 @@ class ImageMeasurement:
             "model_error": _error_document(self),
             "agn": [asdict(image) for image in self.agn],
             "arc_magnitude": self.arc_magnitude,
-            "deflector": None if fit.deflector is None else asdict(fit.deflector),
+            "deflector": _deflector_document(fit),
+            "deflector_gaussians": [asdict(one) for one in fit.deflector_gaussians],
+            "arc_error": fit.arc_error,
+            "priors": self.priors,
+            "decided_by_priors": list(prior_dominated(fit)),
             "background": fit.background,
             "profile": self.profile,
             "seed": self.seed,
@@ -186,6 +200,14 @@ def _host_document(found: Estimate) -> dict[str, Any]:
     return {"estimator": name, **{key: _document(value) for key, value in values.items()}}
 
 
+def _deflector_document(fit: ParametricFit) -> dict[str, Any] | None:
+    """The profile, or of Gaussians what all of them have: their whole flux and their place."""
+    if fit.deflector is not None or not fit.deflector_gaussians:
+        return None if fit.deflector is None else asdict(fit.deflector)
+    flux, first = sum(one.flux for one in fit.deflector_gaussians), fit.deflector_gaussians[0]
+    return {"flux": flux, "r_eff": None, "n": None, "q": None, "phi": None, "x": first.x, "y": first.y}
+
+
 def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, scale: float) -> float:
     """chi^2 of residuals (ny, nx) with the noise map times ``scale`` and the error of the AGN's light as it is."""
     used = np.isfinite(fit.sigma)
@@ -218,6 +240,7 @@ def measure_image(
     shear: bool | None = None,
     theta_E: float | None = None,
     positions: Sequence[tuple[float, float]] | None = None,
+    centre: tuple[float, float] | None = None,
     seed: int = 0,
     inversion: bool = True,
     trust_options: bool = False,
@@ -239,6 +262,8 @@ def measure_image(
         Whether the lens has external shear; decided by the data where None.
     theta_E, positions
         A rough Einstein radius [arcsec]; rough AGN positions [arcsec, image frame].
+    centre : (x, y), optional
+        Where the deflector is, to half an arcsec [arcsec, image frame]; found where None.
     seed : int
         For the chain.
     inversion : bool
@@ -259,15 +284,25 @@ def measure_image(
     analysis = profile_analysis(profile, observation)
     if not 0 <= seed < 2**63:
         raise SpecError("seed", seed, "a whole number from 0 to 2^63 - 1")
-    require_hints(observation, theta_E, positions)
+    require_hints(observation, theta_E, positions, centre)
     warnings = [*observation.notes, *unlikely(observation, trusting=trust_options)]
+    observation, masked = without_lone_pixels(observation)
+    warnings += masked
     warnings += require_lens(observation, trusting=trust_options)
     rng = np.random.default_rng(seed)
     with counted() as tally:
-        found = analyse(
-            observation, replace(analysis, estimators=("image",)), rng, agn_images=agn_images, deflector=deflector,
-            shear=shear, theta_E=theta_E, positions=positions, acceptance=_ANY_LENS, progress=progress,
-        )  # fmt: skip
+        how: dict[str, Any] = {
+            "agn_images": agn_images, "deflector": deflector, "shear": shear, "theta_E": theta_E,
+            "positions": positions, "acceptance": _ANY_LENS, "real_galaxy": True, "centre": centre,
+            "progress": progress,
+        }  # fmt: skip
+        image_alone = replace(analysis, estimators=("image",))
+        found = analyse(observation, image_alone, rng, **how)
+        cleaned, told = without_neighbours(observation, found.fit)
+        if told:
+            warnings += told
+            observation = cleaned
+            found = analyse(observation, image_alone, rng, **how)
         fit, orientation = found.fit, observation.orientation
         if inversion:
             try:
@@ -284,22 +319,24 @@ def measure_image(
         warnings.append(f"noise: outside the lens the image scatters by {scale:.2f} of its noise map")
     # Where the map is too large the errors keep it: its excess stands for the noise that neighbouring pixels share.
     inflation = max(1.0, scale)
-    host = turned(image_estimate(fit.hosts["wide"].inflated(inflation), "wide", observation.zero_point), orientation)
+    posterior = fit.hosts["wide"].inflated(inflation)
+    if chi2 > POOR_FIT:
+        posterior = posterior.blurred(arc_misfit(observation, fit))
+    host = turned(image_estimate(posterior, "wide", observation.zero_point), orientation)
     drawn = () if found.inversion is None else found.inversion.estimates
     warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
         warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
     warnings += _of_model(fit)
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
-    status: MeasurementStatus = "ok"
-    if chi2 > POOR_FIT:
-        status = "poor_fit"
+    status = status_of(fit, host, chi2)
     warnings += filter(None, (poor_fit(chi2), undetected(host)))
     return ImageMeasurement(
         host=host,
         estimates=(host, *(turned(one, orientation) for one in drawn if one.index_prior == "wide")),
         lens=_by_name(lens_of_fit(fit, inflation)),
         lens_by_inversion=None if found.inversion is None else _by_name(found.inversion.lens),
+        host_limit=magnitude_limit(host),
         agn=tuple(
             AgnPosition(image.x, image.y, rate_to_magnitude(image.flux, observation.zero_point))
             for image in fit.agn

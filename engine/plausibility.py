@@ -33,17 +33,19 @@ _SHARP = 1.3
 
 
 def require_hints(
-    observation: Observation, theta_E: float | None, positions: Sequence[tuple[float, float]] | None
+    observation: Observation,
+    theta_E: float | None,
+    positions: Sequence[tuple[float, float]] | None,
+    centre: tuple[float, float] | None = None,
 ) -> None:
     """A SpecError where what is said of the lens is no number, or not on the image."""
     half = [0.5 * n * observation.pixel_scale for n in reversed(observation.shape)]
     if theta_E is not None and not (math.isfinite(theta_E) and 0 < theta_E < min(half)):
         raise SpecError("theta_E", theta_E, f"a radius on the image, above 0 and below {min(half):g} arcsec")
-    for position in positions or ():
+    places = [("positions", position) for position in positions or ()]
+    for name, position in (*places, *(() if centre is None else (("centre", centre),))):
         if not all(math.isfinite(value) and abs(value) <= reach for value, reach in zip(position, half, strict=True)):
-            raise SpecError(
-                "positions", tuple(position), f"a place on the image, within {half[0]:g} and {half[1]:g} arcsec"
-            )
+            raise SpecError(name, tuple(position), f"a place on the image, within {half[0]:g} and {half[1]:g} arcsec")
 
 
 def require_lens(observation: Observation, *, trusting: bool = False) -> tuple[str, ...]:

@@ -130,6 +130,8 @@ def analyse(
     acceptance: Acceptance = GOOD_START,
     fixed_index: float | None = None,
     fit: ParametricFit | None = None,
+    real_galaxy: bool = False,
+    centre: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Reconstruction:
     """Reconstruct the host galaxy in an observation of any origin.
@@ -141,7 +143,7 @@ def analyse(
         Estimators and priors; source grid, regularisation, noise treatment, mask and chain of the inversion.
     rng : Generator
         For the chain and the draws; not used where there is no inversion.
-    agn_images, deflector, shear, theta_E, positions, acceptance
+    agn_images, deflector, shear, theta_E, positions, acceptance, real_galaxy, centre
         What the observer sees and accepts, as :func:`~engine.parametric.fit.fit_parametric` takes it.
     fixed_index : float, optional
         The n at which the fixed-n estimates hold it; without it there are none.
@@ -163,6 +165,7 @@ def analyse(
                 fit = fit_parametric(
                     observation, agn_images=agn_images, deflector=deflector, shear=shear, theta_E=theta_E,
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
+                    real_galaxy=real_galaxy, centre=centre,
                 )  # fmt: skip
         if fit.error is not None:
             observation = replace(observation, psf=fit.psf)
@@ -204,9 +207,14 @@ def undetected(host: Estimate) -> str:
     significance = 2.5 / math.log(10.0) / host.magnitude.sd
     if significance >= DETECTED:
         return ""
-    limit = host.magnitude.mean - _BRIGHT_SIDE * host.magnitude.sd
+    limit = brightest_limit(host)
     told = f"its flux is {significance:.1f} times its error, {DETECTED:g} are a detection"
     return f"host: not detected: {told}; fainter than {limit:.1f} mag (95 %)"
+
+
+def brightest_limit(host: Estimate) -> float:
+    """The magnitude that a host is fainter than with 95 %."""
+    return host.magnitude.mean - _BRIGHT_SIDE * host.magnitude.sd
 
 
 def _priors(fixed_index: float | None) -> list[IndexPrior]:

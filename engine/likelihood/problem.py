@@ -63,6 +63,11 @@ def _amplitude_images(observation: Observation, fit: ParametricFit) -> tuple[tup
     if fit.deflector is not None:
         names.append("deflector")
         images.append(observation.optics.sersic_image(replace(fit.deflector, flux=1.0)))
+    elif fit.deflector_gaussians:
+        names.append("deflector")
+        total = sum(one.flux for one in fit.deflector_gaussians)
+        shown = np.stack([observation.optics.sersic_image(one) for one in fit.deflector_gaussians])
+        images.append(shown.sum(axis=0) / total)
     names.append("background")
     images.append(np.ones(observation.shape))
     return tuple(names), np.stack(images)

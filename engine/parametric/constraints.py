@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,12 +15,42 @@ from engine.spec.priors import LensParameterName, ParameterPrior
 
 POSITION_ERROR = 0.01
 """Image-plane accuracy [arcsec] asked of the AGN images as images of one source."""
-SLOPE_PRIOR = (2.0, 0.3)
-"""Mean and standard deviation; elliptical lenses have 2.08 +- 0.16 (Auger et al. 2010)."""
-SHEAR_PRIOR = 0.15
-ELLIPTICITY_PRIOR = 0.25
-CENTRE_PRIOR = 0.1
-"""Offset [arcsec] of the lens from the deflector's light, or from the frame where it has none."""
+
+
+@dataclass(frozen=True)
+class LensPriors:
+    """Mean and standard deviation of the slope; deviations of shear, (e1, e2) and offset from the light [arcsec]."""
+
+    slope: tuple[float, float]
+    shear: float
+    ellipticity: float
+    centre: float
+
+    @property
+    def told(self) -> dict[str, float]:
+        """By name, for a document."""
+        return {
+            "slope": self.slope[0],
+            "slope_sd": self.slope[1],
+            "shear_sd": self.shear,
+            "ellipticity_sd": self.ellipticity,
+            "centre_sd": self.centre,
+        }
+
+
+WIDE = LensPriors(slope=(2.0, 0.3), shear=0.15, ellipticity=0.25, centre=0.1)
+"""Ellipticity about none; offset from the deflector's light, or from the middle of the frame where it has none."""
+GALAXY = LensPriors(slope=(2.05, 0.16), shear=0.05, ellipticity=0.1, centre=0.03)
+"""Behind a galaxy that is more than one profile: ellipticity about that of its light.
+
+Arcs that no Sersic profile describes would take the lens anywhere. Elliptical lenses have a slope of 2.08 +- 0.16
+(Auger et al. 2010), and their mass follows their light (Koopmans et al. 2006, Bolton et al. 2008).
+"""
+HOST_RADII = (0.5, 0.25)
+"""Einstein radii from which on a host is too large to be one behind a bright galaxy, and error of its logarithm.
+
+Without it the host describes what is left of the galaxy's wings.
+"""
 _BOUND_ERROR = 1e-3
 """How far q or phi may stray beyond a bound that is asked for, which is no bound of an ellipticity."""
 
@@ -29,18 +60,34 @@ def constraints(
 ) -> FloatArray:
     """Departures from the priors, each in its own error; last the AGN images in the source plane about the host."""
     lens, host = values[space.lens_slice], values[space.host_slice]
+    known = WIDE if space.light is None else GALAXY
     slope_free = "slope" not in priors or priors["slope"].mean is None
     out: list[FloatArray] = [
         _misfits(space, values, priors),
-        lens[1:3] / ELLIPTICITY_PRIOR,
-        (lens[3:4] - SLOPE_PRIOR[0]) / (SLOPE_PRIOR[1] if slope_free else math.inf),
-        (lens[4:6] - (values[space.deflector_slice][4:6] if space.deflector else 0.0)) / CENTRE_PRIOR,
-        lens[6:8] / SHEAR_PRIOR,
+        _ellipticity(space, lens[1:3]),
+        (lens[3:4] - known.slope[0]) / (known.slope[1] if slope_free else math.inf),
+        (lens[4:6] - _centre(space, values)) / known.centre,
+        lens[6:8] / known.shear,
     ]
+    if space.light is not None:
+        out.append(np.maximum(host[:1] - math.log(HOST_RADII[0] * lens[0]), 0.0) / HOST_RADII[1])
     if space.n_agn:
         bx, by = source_position(space.lens(values), *space.agn(values).T)
         out += [(bx - host[4]) / POSITION_ERROR, (by - host[5]) / POSITION_ERROR]
     return np.concatenate(out)
+
+
+def _ellipticity(space: ParameterSpace, found: FloatArray) -> FloatArray:
+    if space.light is None:
+        return np.asarray(found / WIDE.ellipticity)
+    return np.asarray((found - np.array(space.light.ellipticity)) / GALAXY.ellipticity)
+
+
+def _centre(space: ParameterSpace, values: FloatArray) -> FloatArray:
+    """Where the deflector shines [arcsec]; the middle of the frame where it does not."""
+    if space.deflector:
+        return values[space.deflector_slice][4:6]
+    return np.array(space.middle if space.light is None else space.light.centre)
 
 
 def worst_miss(space: ParameterSpace, values: FloatArray) -> float:

@@ -7,8 +7,9 @@ whole of it (:mod:`.refine`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -19,16 +20,17 @@ from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, profile_of
 from engine.parametric.constraints import worst_miss
+from engine.parametric.galaxies import asks_for_galaxy, with_galaxy
 from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.parametric.model import ImageModel
 from engine.parametric.numerical_error import HostShift, host_shifts
-from engine.parametric.parameters import BACKGROUND, HOST_FLUX
+from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
 from engine.parametric.shared_error import ModelError
 from engine.parametric.solution import Solution
-from engine.parametric.uncertainty import host_posteriors, parameter_covariance
+from engine.parametric.uncertainty import host_posteriors, parameter_covariance, positive_mean
 from engine.result import IndexPrior
 from engine.spec.priors import LensParameterName, ParameterPrior
 
@@ -46,17 +48,21 @@ class ParametricFit:
 
     ``host.flux`` and ``deflector.flux`` are the fitted fluxes [e-/s]; ``agn`` are the fitted positions and fluxes;
     ``lens_covariance`` (k, k) is that of the lens parameters in the order of ``lens_names``, all other parameters free,
-    multiplied by chi^2 per degree of freedom where that is above one. ``chi2`` counts the fitted pixels with ``sigma``
-    (ny, nx), their noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many
-    times what is allowed for moved stamps the residuals at AGN images show. ``hosts`` are the posteriors of the host
-    with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of all and
-    of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how much,
-    or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are numerical errors of the ``hosts``.
+    multiplied by chi^2 per degree of freedom where that is above one. A deflector that is more than one profile is
+    ``deflector_gaussians``, and ``deflector`` is None. ``chi2`` counts the fitted pixels with ``sigma`` (ny, nx), their
+    noise and the error of the PSF, infinite where a pixel was not fitted; ``stamp_error`` is how many times what is
+    allowed for moved stamps the residuals at AGN images show, ``arc_error`` by which part of their light the
+    covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of
+    the host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
+    all and of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how
+    much, or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are numerical errors of the
+    ``hosts``.
     """
 
     lens: PowerLawLens
     host: SersicProfile
     deflector: SersicProfile | None
+    deflector_gaussians: tuple[SersicProfile, ...]
     agn: tuple[Detection, ...]
     background: float
     lens_names: tuple[str, ...]
@@ -65,6 +71,7 @@ class ParametricFit:
     chi2: float
     degrees_of_freedom: int
     stamp_error: float
+    arc_error: float
     at_bound: tuple[str, ...]
     model: FloatArray
     arc: FloatArray
@@ -90,6 +97,8 @@ def fit_parametric(
     acceptance: Acceptance = GOOD_START,
     priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
     fixed_index: float | None = None,
+    real_galaxy: bool = False,
+    centre: tuple[float, float] | None = None,
 ) -> ParametricFit:
     """Find lens, AGN images and host, from nothing but the observation.
 
@@ -112,6 +121,11 @@ def fit_parametric(
         What is known of lens parameters, by name, instead of the wide priors that hold otherwise.
     fixed_index : float, optional
         An index at which the host's n is held for one more of its posteriors.
+    real_galaxy : bool
+        Whether a deflector may be more than one Sersic profile, where the residuals ask for it, may stand anywhere, and
+        its host may be one that AGN images show alone.
+    centre : (x, y), optional
+        Where the deflector is, to half an arcsec [arcsec, image frame].
 
     Raises
     ------
@@ -125,18 +139,25 @@ def fit_parametric(
         raise SpecError("agn_images", agn_images, "a number from 0 to 8")
     if theta_E is not None and not 0 < theta_E < radius:
         raise SpecError("theta_E", theta_E, f"a radius on the image, below {radius:g}")
-    task = Task(observation, deflector, shear, acceptance, priors)
+    task = Task(
+        observation, deflector, shear, acceptance, priors, dark_host=real_galaxy, near=centre, anywhere=real_galaxy
+    )
     groups = find_starts(task, agn_images, theta_E, positions)
     best: ParametricFit | None = None
     refusals: list[str] = []
+    told = positions is not None or agn_images is not None
     for wave in (groups, [varied_starts(group) for group in groups]):
         for solution in ranked(task, [quick_fits(task, group) for group in wave]):
             try:
-                found = fit_of(task, polished(task, solution), fixed_index)
+                reached = polished(task, solution)
+                if real_galaxy and deflector and asks_for_galaxy(reached):
+                    reached = with_galaxy(task, reached, theta_E, agn_told=told)
+                found = fit_of(task, reached, fixed_index)
             except PosteriorError as error:
                 refusals.append(str(error))
                 continue
-            if found.misfit < _DOUBTFUL:
+            # Behind a galaxy of Gaussians every Einstein radius has been tried.
+            if found.misfit < _DOUBTFUL or found.deflector_gaussians:
                 return found
             if best is None or found.misfit < best.misfit:
                 best = found
@@ -150,9 +171,11 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
     model, values, space = solution.model, solution.values, solution.space
     jacobian, amplitudes = model.full_jacobian(values)
     host_departs, unmodelled, rest = model.explained(values)
-    chi2, freedom = float(rest @ rest), model.pixels - space.size - space.amplitudes - round(model.shared_parameters)
+    freedom = model.pixels - space.size - space.amplitudes - round(model.shared_parameters)
+    covered = float(rest @ rest)
+    chi2 = covered if solution.noise is None else _chi2_of(solution, rest, solution.noise)
     flux = float(amplitudes[HOST_FLUX])
-    if not flux > 0:
+    if not flux > 0 and not (task.dark_host and space.n_agn):
         raise PosteriorError(f"parametric model: the host's flux is {flux:.3g} e-/s, a positive one is needed")
     if not freedom > 0 or chi2 > task.acceptance.chi2_per_dof * freedom:
         raise PosteriorError(
@@ -164,17 +187,22 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         raise PosteriorError(
             f"parametric model: an AGN image maps {miss:.3f} arcsec from the host, {task.acceptance.miss:g} are allowed"
         )
-    inflation = max(1.0, chi2 / freedom)
+    inflation = max(1.0, covered / freedom)
     covariance = inflation * parameter_covariance(model, jacobian)
-    hosts = host_posteriors(solution, covariance, inflation, fixed_index)
+    if not flux > 0:
+        flux = positive_mean(flux, math.sqrt(float(covariance[HOST_FLUX, HOST_FLUX])))
+    hosts = host_posteriors(solution, flux, covariance, inflation, fixed_index)
     shape = model.observation.shape
-    shown = ImageModel(model.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True)
+    shown = ImageModel(
+        model.observation, space, np.ones(shape), model.window, subrays=SUBRAYS, exact=True, galaxy=model.galaxy
+    )
     columns = shown.columns(values)
     deflector = profile_of(values[space.deflector_slice], float(amplitudes[space.n_agn])) if space.deflector else None
     return ParametricFit(
         lens=solution.lens,
         host=space.host(values, flux),
         deflector=deflector,
+        deflector_gaussians=_gaussians(space, amplitudes),
         agn=solution.agn(),
         background=float(amplitudes[BACKGROUND]),
         lens_names=space.lens_names,
@@ -183,13 +211,29 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         chi2=chi2,
         degrees_of_freedom=freedom,
         stamp_error=solution.stamp_error,
+        arc_error=solution.arc_error,
         at_bound=solution.at_bound,
         model=(columns @ amplitudes).reshape(shape) + unmodelled,
         arc=(columns[:, HOST_FLUX] * flux).reshape(shape) + host_departs,
-        sigma=model.sigma,
+        sigma=model.sigma if solution.noise is None else solution.noise,
         psf=model.observation.psf,
         error=solution.error,
         shifts=host_shifts(
             solution, jacobian, amplitudes, {prior: host.covariance[_N, _N] == 0.0 for prior, host in hosts.items()}
         ),
     )
+
+
+def _gaussians(space: ParameterSpace, amplitudes: FloatArray) -> tuple[SersicProfile, ...]:
+    """The Gaussians that the deflector's light is made of, with their fluxes."""
+    if space.light is None:
+        return ()
+    fluxes = amplitudes[space.n_agn : space.n_agn + space.gaussians].tolist()
+    return tuple(replace(one, flux=flux) for one, flux in zip(space.light.gaussians, fluxes, strict=True) if flux > 0)
+
+
+def _chi2_of(solution: Solution, rest: FloatArray, noise: FloatArray) -> float:
+    """chi^2 of whitened residuals with the noise that does not let the arcs be off."""
+    counted = np.isfinite(noise) & np.isfinite(solution.model.sigma)
+    ratio = np.where(counted, solution.model.sigma, 0.0) / np.where(counted, noise, 1.0)
+    return float(np.sum((rest.reshape(noise[solution.model.window].shape) * ratio[solution.model.window]) ** 2))

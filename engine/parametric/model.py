@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from copy import copy
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.errors import PosteriorError
@@ -26,6 +27,7 @@ from engine.light.refinement import Leaves
 from engine.light.rendering import rendered, sample_sersic
 from engine.light.sersic import SHAPE, SersicProfile, profile_of
 from engine.parametric.constraints import constraints
+from engine.parametric.galaxy_light import non_negative
 from engine.parametric.parameters import HOST_FLUX, ParameterSpace, lens_of
 from engine.parametric.shared_error import SharedError
 from engine.spec.priors import LensParameterName, ParameterPrior
@@ -56,6 +58,8 @@ class ImageModel:
         these are known; without it the rays are samples and the AGN are shifted stamps: for quick first fits.
     priors : mapping, optional
         What is known of lens parameters, by name; each replaces the prior that holds otherwise.
+    galaxy : array (gaussians, ny, nx), optional
+        Images of unit flux of the Gaussians that the deflector's light is made of, where the space has any.
     shared : SharedError, optional
         Errors [e-/s] that pixels of the window share, as that of the PSF: their amplitudes are marginalised.
     """
@@ -70,8 +74,10 @@ class ImageModel:
         subrays: int,
         exact: bool,
         priors: Mapping[LensParameterName, ParameterPrior] = MappingProxyType({}),
+        galaxy: FloatArray | None = None,
         shared: SharedError | None = None,
     ) -> None:
+        self.galaxy = galaxy
         self.observation, self.space, self.window = observation, space, window
         self.subrays, self.exact, self.priors = subrays, exact, priors
         ny, nx = observation.shape
@@ -93,6 +99,8 @@ class ImageModel:
         self._target = self._observed
         self.data = self.decorrelated(self._target)
         self.pixels = int(np.count_nonzero(self.weight))
+        inner = np.zeros((0, 1)) if galaxy is None else galaxy[:, window[0], window[1]].reshape(len(galaxy), -1)
+        self._galaxy = inner * self.weight
         # Of the host, what :meth:`corrected` has taken off the data.
         self.host_defect: FloatArray = np.zeros_like(self.data)
         self._anchors: dict[int, tuple[float, float, FloatArray]] = {}
@@ -193,6 +201,7 @@ class ImageModel:
         out = [self._point(k, float(x), float(y)) for k, (x, y) in enumerate(space.agn(values))]
         if space.deflector:
             out.append(self._deflector(*values[space.deflector_slice].tolist())[0])
+        out.extend(self._galaxy)
         out.append(self._host(*values[space.lens_slice.start :].tolist())[0])
         out.append(self.weight)
         return np.stack(out, axis=1)
@@ -205,9 +214,18 @@ class ImageModel:
         if not (size > 0).all():
             raise PosteriorError("parametric model: a component puts no light on the image")
         count("columns_solved", size.size)
+        if self.space.gaussians:
+            best = non_negative(seen, self.data, ~self._gaussian)
+            return best, self.data - seen @ best, columns
         scaled = seen / size
         best = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ self.data, rcond=1e-12)[0]
         return best / size, self.data - scaled @ best, columns
+
+    @cached_property
+    def _gaussian(self) -> NDArray[np.bool_]:
+        """Which amplitudes are those of Gaussians."""
+        place = np.arange(self.space.amplitudes) - self.space.n_agn
+        return (place >= 0) & (place < self.space.gaussians)
 
     def decorrelated(self, values: FloatArray) -> FloatArray:
         """Whitened values (pixels, ...) with the errors that pixels share taken into account."""
@@ -264,7 +282,8 @@ class ImageModel:
         """
         best, _, columns = self.amplitudes(values)
         moved = self.decorrelated(self._column_derivatives(values, best))
-        basis, _ = np.linalg.qr(self.decorrelated(columns))
+        # Gaussians that do not shine stay dark in a small step.
+        basis, _ = np.linalg.qr(self.decorrelated(columns[:, ~self._gaussian | (best > 0)]))
         moved -= basis @ (basis.T @ moved)
         return np.concatenate([-moved, _differences(lambda v: constraints(self.space, v, self.priors), values, 1e-6)])
 
@@ -272,7 +291,8 @@ class ImageModel:
         """Derivatives (rows, parameters + amplitudes) of data and constraints by all parameters; the amplitudes."""
         best, _, columns = self.amplitudes(values)
         rows = _differences(lambda v: constraints(self.space, v, self.priors), values, 1e-6)
-        top = self.decorrelated(np.concatenate([self._column_derivatives(values, best), columns], axis=1))
+        shining = columns * (~self._gaussian | (best > 0))
+        top = self.decorrelated(np.concatenate([self._column_derivatives(values, best), shining], axis=1))
         below = np.concatenate([-rows, np.zeros((rows.shape[0], best.size))], axis=1)
         return np.concatenate([top, below]), best
 

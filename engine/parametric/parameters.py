@@ -22,6 +22,9 @@ HOST_FLUX, BACKGROUND = -2, -1
 """Places among the amplitudes."""
 
 SLOPE_RANGE, SHEAR_RANGE = (1.3, 2.7), (-0.4, 0.4)
+GALAXY_SLOPES, GALAXY_SHEARS = (1.5, 2.6), (-0.2, 0.2)
+"""Behind a galaxy that is more than one profile; its (e1, e2) and centre are within these of those of its light."""
+_LIGHT_REACH, _LIGHT_OFFSET = 0.25, 0.12
 _ELLIPTICITY_RANGE = (-0.6, 0.6)
 _EINSTEIN_RADII = (0.4, 1.8)
 """Bounds of theta_E in units of where a fit begins; the host lies within one theta_E of the lens."""
@@ -48,16 +51,29 @@ def own_parameter(name: LensParameterName) -> bool:
 
 
 @dataclass(frozen=True)
+class KnownLight:
+    """What is known of the light of a deflector whose shape is not fitted: centre [arcsec], (e1, e2), its Gaussians."""
+
+    centre: tuple[float, float]
+    ellipticity: tuple[float, float]
+    gaussians: tuple[SersicProfile, ...]
+
+
+@dataclass(frozen=True)
 class ParameterSpace:
     """Which components the model has, and where their parameters stand in a vector.
 
     A vector is [AGN x, y ...][deflector: SHAPE][lens: theta_E, e1, e2, slope, x, y and gamma1, gamma2 with shear]
-    [host: SHAPE]; the amplitudes, which are linear, are [AGN ...][deflector][host][background].
+    [host: SHAPE]; the amplitudes, which are linear, are [AGN ...][deflector][host][background]. Where the deflector's
+    light is Gaussians of known shape (``light``) it has no parameters, and as many amplitudes as there are Gaussians.
+    A lens that does not shine is about the ``middle`` [arcsec].
     """
 
     n_agn: int
     deflector: bool
     shear: bool
+    light: KnownLight | None = None
+    middle: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -96,7 +112,12 @@ class ParameterSpace:
     @property
     def amplitudes(self) -> int:
         """Number of linear ones."""
-        return self.n_agn + int(self.deflector) + 2
+        return self.n_agn + int(self.deflector) + self.gaussians + 2
+
+    @property
+    def gaussians(self) -> int:
+        """Number of Gaussians that the deflector's light is made of."""
+        return 0 if self.light is None else len(self.light.gaussians)
 
     def agn(self, values: FloatArray) -> FloatArray:
         """Positions (n_agn, 2) [arcsec] of the AGN images."""
@@ -146,8 +167,13 @@ class ParameterSpace:
         near = [(x - _CENTRE_REACH, x + _CENTRE_REACH), (y - _CENTRE_REACH, y + _CENTRE_REACH)]
         sides = [(value - reach, value + reach) for value in start[: 2 * self.n_agn].tolist()]
         sides += [_logs(_DEFLECTOR_RADII), _DEFLECTOR_INDICES, e, e, *near] if self.deflector else []
-        sides += [(_EINSTEIN_RADII[0] * theta_E, _EINSTEIN_RADII[1] * theta_E), e, e, SLOPE_RANGE, *near]
-        sides += [SHEAR_RANGE, SHEAR_RANGE] if self.shear else []
+        shapes, slopes, shears = [e, e], SLOPE_RANGE, SHEAR_RANGE
+        if self.light is not None:
+            shapes = [(value - _LIGHT_REACH, value + _LIGHT_REACH) for value in self.light.ellipticity]
+            near = [(value - _LIGHT_OFFSET, value + _LIGHT_OFFSET) for value in self.light.centre]
+            slopes, shears = GALAXY_SLOPES, GALAXY_SHEARS
+        sides += [(_EINSTEIN_RADII[0] * theta_E, _EINSTEIN_RADII[1] * theta_E), *shapes, slopes, *near]
+        sides += [shears, shears] if self.shear else []
         sides += [_logs(_HOST_RADII), INDEX_RANGES["wide"], e, e]
         sides += [(x - theta_E, x + theta_E), (y - theta_E, y + theta_E)]
         low, high = np.array(sides).T

@@ -14,7 +14,7 @@ from engine.conventions import FloatArray, pixel_centres
 from engine.lensing.power_law import PowerLawLens
 from engine.parametric.model import ImageModel, weights_sigma
 from engine.parametric.model_error import learned
-from engine.parametric.parameters import ParameterSpace
+from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.residual_noise import measured_stamp_error, noise_scale
 from engine.parametric.search import Task, agn_light
@@ -36,6 +36,8 @@ _RIVAL = 2.0
 _BORDER = 3
 _RADII, _LEAST_RADIUS = 3.0, 2.5
 """The image is fitted within so many Einstein radii, at least so many arcsec, and not in so many border pixels."""
+_ARC_ERRORS = (0.01, 0.3)
+"""Least and most part of its light by which an arc may be off."""
 _FEWEST_RADII = 2.2
 """Einstein radii that are fitted even where stamps of AGN images end in them."""
 
@@ -57,23 +59,23 @@ def ranked(task: Task, groups: list[list[Solution]]) -> list[Solution]:
     chosen += [s for s in with_agn if s.information < _RIVAL * with_agn[0].information]
     if len(chosen) < 2:
         return best[:2]
-    sigma = _sigma(task, with_agn[0] if with_agn else chosen[0])
-    full = [_full(task, solution, sigma, shear=task.may_shear) for solution in chosen]
+    sigma = fitted_sigma(task, with_agn[0] if with_agn else chosen[0])
+    full = [full_fit(task, solution, sigma, shear=task.may_shear) for solution in chosen]
     return sorted(full, key=attrgetter("information"))[:2]
 
 
 def polished(task: Task, solution: Solution) -> Solution:
     """The fit of the whole image from another one; with shear where it is wanted, or is worth its parameters."""
-    best = _full(task, solution, _sigma(task, solution), shear=task.may_shear)
+    best = full_fit(task, solution, fitted_sigma(task, solution), shear=task.may_shear)
     error = _stamp_error(task, best)
     if error is not None and error != best.stamp_error:
         best = replace(best, stamp_error=error)
-        best = _full(task, best, _sigma(task, best), shear=task.may_shear)
+        best = full_fit(task, best, fitted_sigma(task, best), shear=task.may_shear)
     if task.observation.optics.misfit_is_noise:
         best = _with_model_error(task, best)
         task = replace(task, observation=best.model.observation)
     if task.shear is None and not _shear_shows(best):
-        best = _full(task, best, best.model.sigma, shear=False, shared=best.model.shared)
+        best = full_fit(task, best, best.model.sigma, shear=False, shared=best.model.shared)
     for _ in range(task.observation.optics.correction_rounds):
         best = minimise(
             best.model.corrected(best.values), best.start, best.values, NEAR_STEPS, TOLERANCE,
@@ -94,7 +96,7 @@ def _with_model_error(task: Task, solution: Solution) -> Solution:
         known = found.error
         task = replace(task, observation=replace(task.observation, psf=given + known.correction))
         solution = replace(solution, stamp_error=found.left, error=known)
-        solution = _full(task, solution, _sigma(task, solution), shear=task.may_shear, shared=found.shared)
+        solution = full_fit(task, solution, fitted_sigma(task, solution), shear=task.may_shear, shared=found.shared)
     return solution
 
 
@@ -107,7 +109,7 @@ def _noise_excess(task: Task, solution: Solution) -> FloatArray:
     return np.asarray((max(1.0, scale) ** 2 - 1.0) * np.where(observation.valid, observation.noise, 0.0) ** 2)
 
 
-def _full(
+def full_fit(
     task: Task, solution: Solution, sigma: FloatArray, *, shear: bool, shared: SharedError | None = None
 ) -> Solution:
     """The fit of the whole image that begins where another ended."""
@@ -115,8 +117,9 @@ def _full(
     space: ParameterSpace = replace(solution.space, shear=shear)
     whole = slice(0, ny), slice(0, nx)
     model = ImageModel(
-        task.observation, space, sigma, whole, subrays=SUBRAYS, exact=True, priors=task.priors, shared=shared
-    )
+        task.observation, space, sigma, whole, subrays=SUBRAYS, exact=True, priors=task.priors, shared=shared,
+        galaxy=solution.model.galaxy,
+    )  # fmt: skip
     values = solution.space.with_shear(solution.values, shear=shear)
     found = minimise(model, solution.start, values, _STEPS, TOLERANCE, stamp_error=solution.stamp_error)
     return replace(found, error=solution.error)
@@ -131,7 +134,7 @@ def _variances(task: Task, solution: Solution) -> tuple[FloatArray, FloatArray]:
     return optics.agn_variance(agn_light(task.observation, solution.agn())), optics.extended_variance(light)
 
 
-def _sigma(task: Task, solution: Solution) -> FloatArray:
+def fitted_sigma(task: Task, solution: Solution) -> FloatArray:
     """Standard deviation of the pixels of the final fit, the PSF's errors included; infinite where not fitted."""
     stamps, extended = _variances(task, solution)
     sigma = weights_sigma(task.observation, solution.stamp_error**2 * stamps + extended)
@@ -151,6 +154,22 @@ def _fitted(task: Task, lens: PowerLawLens, agn: Sequence[Detection]) -> NDArray
         reach = max(math.hypot(found.x - lens.x, found.y - lens.y) for found in agn)
         radius = min(radius, max(task.observation.optics.star_radius - reach, _FEWEST_RADII * lens.theta_E))
     return np.asarray(np.hypot(y[:, None] - lens.y, x[None, :] - lens.x) <= radius)
+
+
+def measured_arc_error(task: Task, solution: Solution, sigma: FloatArray) -> tuple[float, FloatArray]:
+    """By which part of their light the arcs of a full fit are off, as the residuals show it; their variance (ny, nx).
+
+    ``sigma`` is that of all else. Real hosts have clumps and arms: what they miss of a Sersic profile is no noise.
+    """
+    amplitudes, _, columns = solution.model.amplitudes(solution.values)
+    arc = solution.model.unwhitened(columns[:, HOST_FLUX:BACKGROUND], amplitudes[HOST_FLUX:BACKGROUND])
+    model = solution.model.unwhitened(columns, amplitudes)
+    counted = np.isfinite(sigma) & np.isfinite(solution.model.sigma)
+    residual = np.where(counted, task.observation.image - model, 0.0)
+    scale = noise_scale(task.observation, residual, sigma, solution.lens) or 1.0
+    others = np.where(counted, sigma**2 + (scale**2 - 1.0) * weights_sigma(task.observation) ** 2, np.inf)
+    part = measured_stamp_error(residual, arc**2, others, _ARC_ERRORS)
+    return (0.0, np.zeros(arc.shape)) if part is None else (part, (part * arc) ** 2)
 
 
 def _stamp_error(task: Task, solution: Solution) -> float | None:

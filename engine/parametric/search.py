@@ -17,10 +17,12 @@ from engine.parametric.parameters import HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection, find_point_sources
 from engine.parametric.solution import Solution, minimise
 from engine.parametric.starts import (
+    CENTRE_REACH,
     Start,
     agn_hypotheses,
     deflector_centre,
     filled_image,
+    off_centre,
     ring_radii,
     starts_from_agn,
     starts_from_arc,
@@ -32,6 +34,8 @@ _QUICK_WINDOW = 1.6
 _QUICK_MARGIN = 0.5
 _QUICK_STEPS, _QUICK_TOLERANCE, _QUICK_SUBRAYS = 15, 1e-4, 1
 _MOST_CANDIDATES, _ERRING_CANDIDATES = 6, 4
+_TELLING_IMAGES = 3
+"""AGN images that tell of a lens though no host shows."""
 _AGN_NUMBERS = (4, 3, 2, 0)
 _ARC_STARTS = 4
 
@@ -48,7 +52,8 @@ class Acceptance:
 class Task:
     """What is fitted: an observation, what the model may have, and what is known.
 
-    ``shear`` is None where the fit has to tell whether there is any.
+    ``shear`` is None where the fit has to tell whether there is any; a ``dark_host`` may be one that the image does not
+    show; the deflector is ``near`` a place [arcsec], or ``anywhere``, or near the middle.
     """
 
     observation: Observation
@@ -56,6 +61,9 @@ class Task:
     shear: bool | None
     acceptance: Acceptance
     priors: Mapping[LensParameterName, ParameterPrior]
+    dark_host: bool = False
+    near: tuple[float, float] | None = None
+    anywhere: bool = False
 
     @cached_property
     def image(self) -> FloatArray:
@@ -71,8 +79,15 @@ class Task:
     @cached_property
     def centre(self) -> tuple[float, float]:
         """Where the deflector shines [arcsec]; the middle, where its light shows nowhere near it."""
-        shining = deflector_centre(self.image, self.observation.pixel_scale) if self.deflector else None
-        return (0.0, 0.0) if shining is None else shining
+        scale, origin = self.observation.pixel_scale, self.near or (0.0, 0.0)
+        if not self.deflector:
+            return origin
+        shining = deflector_centre(self.image, scale, origin)
+        if self.anywhere and self.near is None:
+            elsewhere = off_centre(self.image, self.noise, scale)
+            if elsewhere is not None and math.hypot(*elsewhere) > CENTRE_REACH:
+                return deflector_centre(self.image, scale, elsewhere) or elsewhere
+        return origin if shining is None else shining
 
     @property
     def may_shear(self) -> bool:
@@ -127,7 +142,9 @@ def quick_fits(task: Task, group: list[Start]) -> list[Solution]:
         observation.shape, observation.pixel_scale, task.centre, _QUICK_WINDOW * reach + _QUICK_MARGIN
     )
     # Without it an arc that was sheared ends in one of several false minima, far from the true lens.
-    space = ParameterSpace(len(first.agn), task.deflector, shear=task.may_shear or first.lens.gamma1 != 0.0)
+    space = ParameterSpace(
+        len(first.agn), task.deflector, shear=task.may_shear or first.lens.gamma1 != 0.0, middle=task.near or (0.0, 0.0)
+    )
     # One noise map for all hypotheses, or their chi^2 could not be compared.
     light = agn_light(observation, task.candidates(_ERRING_CANDIDATES))
     sigma = weights_sigma(observation, observation.optics.agn_variance(light))
@@ -140,7 +157,7 @@ def quick_fits(task: Task, group: list[Start]) -> list[Solution]:
             found = minimise(model, start, start.vector(space), _QUICK_STEPS, _QUICK_TOLERANCE)
         except PosteriorError:
             continue
-        if found.host_flux > 0:
+        if found.host_flux > 0 or (task.dark_host and space.n_agn >= _TELLING_IMAGES):
             out.append(found)
     return out
 

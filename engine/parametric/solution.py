@@ -30,6 +30,8 @@ class Solution:
 
     ``start`` is where the search for it began; ``stamp_error`` is the error of the light of AGN images that its noise
     map holds, in units of what the optics allow for; ``error`` are the errors of the model that it marginalises.
+    ``noise`` (ny, nx) is the model's without the error of the arcs, where that has one, ``arc_error`` that part of
+    their light: no host is a Sersic profile.
     """
 
     model: ImageModel
@@ -39,6 +41,8 @@ class Solution:
     cost: float
     start: Start
     stamp_error: float = 1.0
+    noise: FloatArray | None = None
+    arc_error: float = 0.0
     error: ModelError | None = None
 
     @property

@@ -17,8 +17,9 @@ from engine.parametric.lens_start import lens_from_positions
 from engine.parametric.parameters import ParameterSpace
 from engine.parametric.point_sources import Detection
 
-_CENTRE_REACH = 0.5
+CENTRE_REACH = 0.5
 """Farthest [arcsec] that the deflector is looked for from the middle of the image."""
+_CENTRE_SIGMA, _CENTRE_RADIUS, _CENTRE_PEAKS = 3.0, 2.0, 12
 _MOST_CANDIDATES = 6
 _CONSISTENT = 0.15
 """Misfit [arcsec] from which on positions are not the images of one source behind a power law without shear."""
@@ -59,18 +60,22 @@ def filled_image(observation: Observation) -> FloatArray:
     return np.where(observation.valid, observation.image, np.where(np.isfinite(smooth), smooth, level))
 
 
-def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, float] | None:
-    """The peak [arcsec] that is reached by climbing from the middle of the image, smoothed by a pixel.
+def deflector_centre(
+    image: FloatArray, pixel_scale: float, origin: tuple[float, float] = (0.0, 0.0)
+) -> tuple[float, float] | None:
+    """The peak [arcsec] that is reached by climbing from ``origin``, the image smoothed by a pixel.
 
-    None where the climb leaves the inner half arcsec, as without a deflector's light.
+    None where the climb leaves half an arcsec round it, as without a deflector's light, or the image.
     """
     smooth = ndimage.gaussian_filter(image, 1.0)
     ny, nx = image.shape
-    row, column = (ny - 1) // 2, (nx - 1) // 2
-    reach = max(1, round(_CENTRE_REACH / pixel_scale))
+    row, column = _pixel_at(image, pixel_scale, origin)
+    reach = max(1, round(CENTRE_REACH / pixel_scale))
     start_row, start_column = row, column
     while True:
         rows, columns = slice(row - 1, row + 2), slice(column - 1, column + 2)
+        if not (0 < row < ny - 1 and 0 < column < nx - 1):
+            return None
         step = np.unravel_index(int(np.argmax(smooth[rows, columns])), (3, 3))
         if int(step[0]) == 1 and int(step[1]) == 1:
             break
@@ -85,6 +90,36 @@ def deflector_centre(image: FloatArray, pixel_scale: float) -> tuple[float, floa
         (column + out[0] - (nx - 1) / 2.0) * pixel_scale,
         (row + out[1] - (ny - 1) / 2.0) * pixel_scale,
     )
+
+
+def _pixel_at(image: FloatArray, pixel_scale: float, place: tuple[float, float]) -> tuple[int, int]:
+    """Row and column of a place [arcsec]."""
+    ny, nx = image.shape
+    return math.floor(place[1] / pixel_scale + (ny - 1) / 2), math.floor(place[0] / pixel_scale + (nx - 1) / 2)
+
+
+def off_centre(image: FloatArray, noise: FloatArray, pixel_scale: float) -> tuple[float, float] | None:
+    """A rough place [arcsec] of the deflector of a lens that is not in the middle; None where the light is about it.
+
+    Of the brightest peaks it is the one about which the light is most symmetric: AGN images and arcs are round their
+    deflector. The square root of the light counts, or the brightest image of an AGN would be the centre.
+    """
+    smooth = ndimage.gaussian_filter(image - float(np.median(image)), 1.0)
+    root = np.sqrt(np.where(smooth > _CENTRE_SIGMA * noise, np.maximum(smooth, 0.0), 0.0))
+    y, x = np.meshgrid(*(pixel_centres(n, pixel_scale) for n in image.shape), indexing="ij")
+    total = float(root.sum())
+    if not total > 0 or math.hypot(float((root * x).sum()), float((root * y).sum())) < CENTRE_REACH * total:
+        return None
+    reach = round(_CENTRE_RADIUS / pixel_scale)
+    padded = np.pad(root, reach)
+    peaks = np.argwhere((smooth == ndimage.maximum_filter(smooth, 3)) & (root > 0))
+    best, most = None, 0.0
+    for row, column in sorted(peaks.tolist(), key=lambda at: -smooth[at[0], at[1]])[:_CENTRE_PEAKS]:
+        around = padded[row : row + 2 * reach + 1, column : column + 2 * reach + 1]
+        symmetric = float((around * around[::-1, ::-1]).sum())
+        if symmetric > most:
+            best, most = (float(x[row, column]), float(y[row, column])), symmetric
+    return best
 
 
 def without_deflector(image: FloatArray, pixel_scale: float, centre: tuple[float, float]) -> FloatArray:

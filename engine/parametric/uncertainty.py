@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, stats
 
 from engine.conventions import FloatArray
 from engine.parametric.host_posterior import HostPosterior
@@ -14,6 +14,8 @@ from engine.parametric.model import ImageModel
 from engine.parametric.parameters import HOST_FLUX
 from engine.parametric.solution import Solution, minimise_held
 from engine.result import INDEX_RANGES, IndexPrior
+
+_TAIL = 8.0
 
 
 def parameter_covariance(model: ImageModel, jacobian: FloatArray, held: int | None = None) -> FloatArray:
@@ -57,17 +59,25 @@ def _shared(model: ImageModel, jacobian: FloatArray) -> FloatArray:
     return 0.5 * (out + out.T)
 
 
+def positive_mean(flux: float, deviation: float) -> float:
+    """Mean of a normal distribution above zero: of a host whose best flux is negative."""
+    ratio = flux / deviation
+    # Far below zero the tail falls as an exponential of this length.
+    return deviation * float(stats.truncnorm.mean(-ratio, np.inf, loc=ratio)) if ratio > -_TAIL else -deviation / ratio
+
+
 def host_posteriors(
-    solution: Solution, covariance: FloatArray, inflation: float, fixed_index: float | None
+    solution: Solution, flux: float, covariance: FloatArray, inflation: float, fixed_index: float | None
 ) -> dict[IndexPrior, HostPosterior]:
     """The host with each prior of n, from a solution with the widest and its covariance, ``inflation`` included.
 
-    A maximum inside a narrower range is that range's too. One outside ends at its bound: everything else is fitted
-    again with n held there. A prior with which the host has no light is left out.
+    ``flux`` [e-/s] is its own, or a positive one that stands for it. A maximum inside a narrower range is that range's
+    too. One outside ends at its bound: everything else is fitted again with n held there. A prior with which the host
+    has no light is left out.
     """
     values, at_n = solution.values, solution.space.host_slice.start + 1
     ranges = INDEX_RANGES if fixed_index is None else {**INDEX_RANGES, "fixed": (fixed_index, fixed_index)}
-    wide = _host_posterior(solution, solution.host_flux, covariance)
+    wide = _host_posterior(solution, flux, covariance)
     out: dict[IndexPrior, HostPosterior] = {"wide": wide}
     for prior, (low, high) in ranges.items():
         if prior == "wide":
@@ -79,10 +89,10 @@ def host_posteriors(
         shift = covariance[: values.size, at_n] / covariance[at_n, at_n] * (held - values[at_n])
         found = minimise_held(solution, values + shift, at_n, held)
         jacobian, amplitudes = found.model.full_jacobian(found.values)
-        flux = float(amplitudes[HOST_FLUX])
-        if flux > 0:
+        bright = float(amplitudes[HOST_FLUX])
+        if bright > 0:
             known = inflation * parameter_covariance(found.model, jacobian, at_n)
-            out[prior] = replace(_host_posterior(found, flux, known).inside(held, held), n_at_bound=low < high)
+            out[prior] = replace(_host_posterior(found, bright, known).inside(held, held), n_at_bound=low < high)
     return out
 
 

@@ -43,7 +43,8 @@ _AT_ONCE = asyncio.Semaphore(2)
 """Files that a process sends to the artefact store at a time: a bucket's driver has them in memory meanwhile."""
 _FILE = {"type": "string", "format": "binary"}
 _OPTIONS = MeasurementOptions.model_json_schema()["properties"] | {
-    "positions": {"type": "array", "items": {"type": "string"}, "description": "x,y of an AGN image, once for each"}
+    "positions": {"type": "array", "items": {"type": "string"}, "description": "x,y of an AGN image, once for each"},
+    "centre": {"type": "string", "description": "x,y of the deflector"},
 }
 _BODY = {
     "requestBody": {

@@ -39,6 +39,9 @@ def measure(
     positions: Annotated[
         list[str] | None, typer.Option(help="x,y of an AGN image in arcsec from the middle; once for each image")
     ] = None,
+    centre: Annotated[
+        tuple[float, float] | None, typer.Option(help="x y of the deflector, arcsec from the middle; found without")
+    ] = None,
     no_deflector: Annotated[bool, typer.Option("--no-deflector", help="The deflector does not shine")] = False,
     shear: Annotated[bool | None, typer.Option("--shear/--no-shear", help="External shear; the data decide")] = None,
     unit: Annotated[str | None, typer.Option(help=f"BUNIT, or e-/s, without; {', '.join(_UNITS)}")] = None,
@@ -89,7 +92,8 @@ def measure(
         with console.status("reading") as status:
             found = measure_image(
                 observation, profile=profile, agn_images=0 if no_agn else agn_images, deflector=not no_deflector,
-                shear=shear, theta_E=theta_e, positions=where, seed=seed, inversion=inversion,
+                shear=shear, theta_E=theta_e, positions=where, centre=centre, seed=seed,
+                inversion=inversion,
                 trust_options=trust_options, progress=lambda stage, _: status.update(_SAID.get(stage, "inversion")),
             )  # fmt: skip
     for line in _summary(found):
@@ -202,6 +206,12 @@ def _summary(found: ImageMeasurement) -> list[str]:
     values = (("magnitude", host.magnitude), ("radius", host.r_eff), ("n", host.n))
     lines = [f"host.{name:10s} {value.mean:8.3f} +- {value.sd:.3f}" for name, value in values]
     lines += [f"lens.{name:10s} {value.mean:8.3f} +- {value.sd:.3f}" for name, value in lens.items()]
+    if found.fit.deflector_gaussians:
+        lines.append(f"deflector: {len(found.fit.deflector_gaussians)} Gaussians instead of a Sersic profile")
+    told = ", ".join(f"{name} {value:g}" for name, value in found.priors.items())
+    lines.append(f"priors of the lens: {told}")
+    if found.host_limit is not None:
+        lines.append(f"host: not detected, fainter than {found.host_limit:.2f} mag (95 %)")
     lines.append(f"{len(found.agn)} AGN images, chi2/dof {found.chi2_per_dof:.2f}, {found.estimator}, {found.status}")
     work = found.work
     told = f"{work.pixels_rendered:,} pixels rendered, {work.rays_traced:,} rays traced, "

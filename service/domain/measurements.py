@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints
 
 from engine import PRINTABLE, spec_digest
 from service.domain.plan import IMAGE, PlannedRun
@@ -20,6 +20,11 @@ Positive = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 Text = Annotated[str, StringConstraints(min_length=1, max_length=80, pattern=PRINTABLE)]
 Place = Annotated[str, StringConstraints(max_length=80, pattern=r"^[^,\s][^,]*,[^,]*[^,\s]$")]
 Offset = Annotated[float, Field(ge=-100.0, le=100.0, allow_inf_nan=False)]
+
+
+def _pair(value: object) -> object:
+    """The two parts of the text that a form has, or of a stored document's pair as it is."""
+    return value.split(",") if isinstance(value, str) else value
 
 
 class MeasurementOptions(BaseModel):
@@ -60,6 +65,8 @@ class MeasurementOptions(BaseModel):
     agn_images: Annotated[int, Field(ge=0, le=20)] | None = None
     positions: Annotated[list[tuple[Offset, Offset]], Field(max_length=20)] = Field(default_factory=list)
     """Of the AGN images [arcsec from the middle]."""
+    centre: Annotated[tuple[Offset, Offset], BeforeValidator(_pair)] | None = None
+    """x,y of the deflector [arcsec from the middle], to half an arcsec; found without."""
     deflector: bool = True
     shear: bool | None = None
     seed: Annotated[int, Field(ge=0, le=2**62)] = 0

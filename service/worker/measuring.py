@@ -49,6 +49,7 @@ def measure(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
             shear=options["shear"],
             theta_E=options["theta_e"],
             positions=[(x, y) for x, y in options["positions"]] or None,
+            centre=options.get("centre"),
             seed=options["seed"],
             inversion=options["inversion"],
             trust_options=options["trust_options"],

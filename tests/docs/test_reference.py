@@ -8,13 +8,7 @@ import re
 import pytest
 from pydantic_core import PydanticUndefined
 
-from engine.parametric.constraints import (
-    CENTRE_PRIOR,
-    ELLIPTICITY_PRIOR,
-    POSITION_ERROR,
-    SHEAR_PRIOR,
-    SLOPE_PRIOR,
-)
+from engine.parametric.constraints import GALAXY, POSITION_ERROR, WIDE
 from engine.reconstruction import POOR_FIT
 from service.domain.states import TRANSITIONS, RunState
 from service.runtime.settings import Settings
@@ -61,11 +55,17 @@ def test_every_operation_is_in_the_table_of_the_api() -> None:
 def test_priors_that_decide_an_answer_are_told_as_they_are(page: str) -> None:
     text = " ".join((ROOT / "docs" / "howto" / f"{page}.md").read_text().split())
     for told in (
-        f"slope {SLOPE_PRIOR[0]} ± {SLOPE_PRIOR[1]}",
-        f"shear 0 ± {SHEAR_PRIOR}",
-        f"ellipticity 0 ± {ELLIPTICITY_PRIOR}",
-        f"within {CENTRE_PRIOR} arcsec (1 sigma)",
+        f"slope {WIDE.slope[0]} ± {WIDE.slope[1]}",
+        f"shear 0 ± {WIDE.shear}",
+        f"ellipticity 0 ± {WIDE.ellipticity}",
+        f"within {WIDE.centre} arcsec (1 sigma)",
         f"to {POSITION_ERROR} arcsec",
         f"bove {POOR_FIT}",
     ):
         assert told in text, told
+    if page == "measure-an-image":
+        narrow = (
+            f"slope {GALAXY.slope[0]} ± {GALAXY.slope[1]}, shear 0 ± {GALAXY.shear}, ellipticity ± {GALAXY.ellipticity}"
+        )
+        assert narrow in text
+        assert f"within {GALAXY.centre} arcsec" in text

@@ -1,0 +1,65 @@
+"""What a measurement is called: whether its host is there, its model fits, and its answer is the data's."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from engine.conventions import FloatArray
+from engine.imaging.observation import Observation
+from engine.parametric.fit import ParametricFit
+from engine.parametric.host_posterior import COORDINATES
+from engine.reconstruction import POOR_FIT, brightest_limit, undetected
+from engine.result import Estimate
+
+MeasurementStatus = Literal["ok", "poor_fit", "not_detected", "prior_dominated"]
+_ARC_SHARE = 0.25
+"""Part of the arc's brightest pixel from which on a pixel is one of the arcs."""
+_STRUCTURE = 1.5
+"""Pixels over which residuals are smoothed that are to be structure and not noise."""
+_PRIOR_WIDTHS = {"ln_r_eff": 1.3, "n": 2.2}
+"""Standard deviations of the host's parameters that its bounds alone would give, nearly."""
+
+
+def status_of(fit: ParametricFit, host: Estimate, chi2_per_dof: float) -> MeasurementStatus:
+    """``poor_fit`` before ``not_detected`` before ``prior_dominated`` before ``ok``."""
+    if chi2_per_dof > POOR_FIT:
+        return "poor_fit"
+    if undetected(host):
+        return "not_detected"
+    return "prior_dominated" if prior_dominated(fit) else "ok"
+
+
+def prior_dominated(fit: ParametricFit) -> tuple[str, ...]:
+    """Names of parameters that a bound or a prior decides and not the data."""
+    posterior = fit.hosts["wide"]
+    deviations = np.sqrt(np.diag(posterior.covariance))
+    wide = [f"host.{name}" for name, width in _PRIOR_WIDTHS.items() if deviations[COORDINATES.index(name)] > width]
+    return (*fit.at_bound, *(name for name in wide if name not in fit.at_bound))
+
+
+def magnitude_limit(host: Estimate) -> float | None:
+    """The magnitude that a host which is not detected is fainter than (95 %); None for one that is."""
+    return brightest_limit(host) if undetected(host) else None
+
+
+def arc_misfit(observation: Observation, fit: ParametricFit) -> float:
+    """Light that the model misses among the arcs, as a part of theirs: the error of a flux that no noise map has."""
+    counted = np.isfinite(fit.sigma)
+    among = counted & (fit.arc > _ARC_SHARE * float(fit.arc[counted].max(initial=0.0)))
+    total = float(fit.arc[among].sum())
+    if not total > 0:
+        return 0.0
+    residual = np.where(counted, observation.image - fit.model, 0.0)
+    missed = _structure(residual, among)
+    noise = _structure(fit.sigma, among) / math.sqrt(4.0 * math.pi * _STRUCTURE**2) * math.sqrt(2.0 / math.pi)
+    return math.sqrt(max(missed**2 - noise**2, 0.0)) / total
+
+
+def _structure(values: FloatArray, among: NDArray[np.bool_]) -> float:
+    smooth = ndimage.gaussian_filter(np.where(np.isfinite(values), values, 0.0), _STRUCTURE)
+    return float(np.abs(smooth[among]).sum())
