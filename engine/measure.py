@@ -30,7 +30,7 @@ from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_f
 from engine.result import Estimate, LensParameter, Quantity
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
-from engine.status import MeasurementStatus, arc_misfit, magnitude_limit, prior_dominated, status_of
+from engine.status import MeasurementStatus, arc_misfit, magnitude_limit, not_detected, prior_dominated, status_of
 from engine.work import Work, counted
 
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
@@ -330,13 +330,13 @@ def measure_image(
     warnings += _of_model(fit)
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     status = status_of(fit, host, chi2)
-    warnings += filter(None, (poor_fit(chi2), undetected(host)))
+    warnings += filter(None, (poor_fit(chi2), undetected(host) if not_detected(fit, host) else ""))
     return ImageMeasurement(
         host=host,
         estimates=(host, *(turned(one, orientation) for one in drawn if one.index_prior == "wide")),
         lens=_by_name(lens_of_fit(fit, inflation)),
         lens_by_inversion=None if found.inversion is None else _by_name(found.inversion.lens),
-        host_limit=magnitude_limit(host),
+        host_limit=magnitude_limit(fit, host),
         agn=tuple(
             AgnPosition(image.x, image.y, rate_to_magnitude(image.flux, observation.zero_point))
             for image in fit.agn

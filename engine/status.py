@@ -17,6 +17,9 @@ from engine.reconstruction import POOR_FIT, brightest_limit, undetected
 from engine.result import Estimate
 
 MeasurementStatus = Literal["ok", "poor_fit", "not_detected", "prior_dominated"]
+_ARC_SEEN = 25.0
+"""Signal-to-noise of all of an arc from which on it is there, however little is known of its host's light: the noise
+alone, fitted by any host, comes to five to twelve."""
 _ARC_SHARE = 0.25
 """Part of the arc's brightest pixel from which on a pixel is one of the arcs."""
 _STRUCTURE = 1.5
@@ -29,9 +32,21 @@ def status_of(fit: ParametricFit, host: Estimate, chi2_per_dof: float) -> Measur
     """``poor_fit`` before ``not_detected`` before ``prior_dominated`` before ``ok``."""
     if chi2_per_dof > POOR_FIT:
         return "poor_fit"
-    if undetected(host):
+    if not_detected(fit, host):
         return "not_detected"
+    if undetected(host):
+        return "prior_dominated"
     return "prior_dominated" if prior_dominated(fit) else "ok"
+
+
+def not_detected(fit: ParametricFit, host: Estimate) -> bool:
+    """Whether the image shows no host: one whose flux is that of noise, and no arc either.
+
+    The flux of a plain arc's host is unknown as well where its size is, as beside a deflector's wings.
+    """
+    counted = np.isfinite(fit.sigma)
+    seen = math.sqrt(float(np.sum((fit.arc[counted] / fit.sigma[counted]) ** 2)))
+    return bool(undetected(host)) and seen < _ARC_SEEN
 
 
 def prior_dominated(fit: ParametricFit) -> tuple[str, ...]:
@@ -42,9 +57,9 @@ def prior_dominated(fit: ParametricFit) -> tuple[str, ...]:
     return (*fit.at_bound, *(name for name in wide if name not in fit.at_bound))
 
 
-def magnitude_limit(host: Estimate) -> float | None:
+def magnitude_limit(fit: ParametricFit, host: Estimate) -> float | None:
     """The magnitude that a host which is not detected is fainter than (95 %); None for one that is."""
-    return brightest_limit(host) if undetected(host) else None
+    return brightest_limit(host) if not_detected(fit, host) else None
 
 
 def arc_misfit(observation: Observation, fit: ParametricFit) -> float:
