@@ -41,6 +41,8 @@ OVERSAMPLING = Knob(
     unit=_UNIT,
     work="the host rendered, its cusps placed, blurred and exposed",
     reference=_REFERENCE,
+    why_off_front="On the fine sub-pixels of UVIS cusps need not be placed, which is a seventh of the time; in F160W "
+    "they are what keeps it at one.",
 )
 _STAMP, _FULL, _DARK = 4.2, 1.4, 2.0
 """Side of the PSF [arcsec], and the radii between which it fades: the same light is left out by all."""

@@ -32,6 +32,7 @@ INTEGRATION = Knob(
     unit="sigma of its noise",
     work="the lensed host on the sub-pixels of the ring",
     reference="Gauss-Legendre on a mesh graded towards the images of the cusp, then the same optics",
+    why_off_front="The hosts of F160W need it; in UVIS a coarser one leaves less than a thousandth as well.",
 )
 _TOLERANCES = (1e-2, 1e-3, DEFAULT_TOLERANCE, 1e-5, 1e-6)
 _UNIFORM = (1, 2, 4, 8)

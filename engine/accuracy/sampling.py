@@ -31,7 +31,12 @@ def _knob(name: str, place: str, work: str, why_off_front: str = "") -> Knob:
 
 
 LESSONS = _knob("surrogate lessons", "engine.posterior.surrogate.Schooling.good", _SAME)
-WALK = _knob("surrogate walk", "engine.posterior.surrogate.Schooling.walk", _SAME)
+WALK = _knob(
+    "surrogate walk",
+    "engine.posterior.surrogate.Schooling.walk",
+    _SAME,
+    "The walk itself costs next to nothing: what differs is how the chain that follows happens to go.",
+)
 WALKERS = _knob("walkers", "Analysis.walkers", _SAME)
 LENGTH = _knob("chain length", "Analysis.chain_length", "surrogate learnt, and the chain")
 _STEPS = 200

@@ -26,7 +26,7 @@ _STRIP = 8
 """Rows of the image that a patch spans."""
 
 _ROUNDING = 2.0**-50
-"""Part of the largest entry of C^-1 B of a patch below which a row of it is no more than rounding."""
+"""Part of the largest entry of a column of C^-1 B below which another is no more than rounding."""
 
 _NEGLIGIBLE = 1e-12
 """Blocks whose entries are all below this part of the geometric mean of their two diagonal entries are left out. Under
@@ -157,13 +157,14 @@ def _couple(  # noqa: PLR0912 - the same
     """
     patch, pixels = out.shape[0] - 1, pointers.size - 1
     used = np.zeros(weighed.shape[0], np.bool_)
-    sizes = np.zeros(weighed.shape[0])
+    # Each column by its own largest entry: beside pixels that hardly count others may count 1e24 times as much.
+    floor = np.zeros(TILE)
     for m in range(low, high):
         for k in range(TILE):
-            sizes[m] = max(sizes[m], abs(weighed[m, k]))
-    floor = _ROUNDING * sizes.max()
+            floor[k] = max(floor[k], _ROUNDING * abs(weighed[m, k]))
     for m in range(low, high):
-        used[m] = sizes[m] > floor
+        for k in range(TILE):
+            used[m] |= abs(weighed[m, k]) > floor[k]
     kept = np.zeros(patch + 1, np.bool_)
     where, what = np.empty(weighed.shape[0], np.int64), np.empty(weighed.shape[0])
     scale = np.zeros(TILE)

@@ -18,7 +18,7 @@ from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import MigrationError, downgrade, upgrade
 from service.store.queue import RunQueue
-from service.store.tables import GROUP_COLUMNS, SUMMED, estimate, grid_moments, input_group, input_moments, result
+from service.store.tables import GROUP_COLUMNS, SUMMED, WORK, estimate, grid_moments, input_group, input_moments, result
 from tests.service.plans import result_of, submit
 
 BODY = {"preset": "h0licow-vi/HE0435", "n": [2, 4], "l_eta": [1.0], "r_eff": [0.39], "replicates": 3}
@@ -150,10 +150,15 @@ def test_estimates_inputs_and_sums_go_through_the_wide_columns_and_back(database
     assert sorted(row[1:-2] for row in again[0]) == sorted(row[1:-2] for row in inputs[0])
     digests = [{row[0]: row[2] for row in found[0]} for found in (inputs, again)]
     for before, after in zip(exactly, rows_of(database, result, estimate), strict=True):
-        place = (estimate if before is exactly[1] else result).c.keys().index("input_id")
+        names = (estimate if before is exactly[1] else result).c.keys()
+        place = names.index("input_id")
+        # What came with later revisions has no place in the wide columns: it is lost on the way, and absent.
+        later = {place, *(k for k, name in enumerate(names) if name in WORK or "_error" in name)}
         for old, new in zip(before, after, strict=True):
             assert digests[0][old[place]] == digests[1][new[place]]
-            assert (*old[:place], *old[place + 1 :]) == (*new[:place], *new[place + 1 :])
+            kept = [k for k in range(len(names)) if k not in later]
+            assert [old[k] for k in kept] == [new[k] for k in kept]
+            assert {new[k] for k in later - {place}} == {None}
     for before, after in zip(about, rows_of(database, input_moments, grid_moments), strict=True):
         names = [digests[0].get(row[0], row[0]) for row in before], [digests[1].get(row[0], row[0]) for row in after]
         ordered = [
