@@ -24,6 +24,8 @@ from engine.parametric.uncertainty import parameter_covariance
 
 SUBRAYS = 2
 _STEPS = 40
+_HOPELESS = 10.0
+"""Times by which chi^2 may exceed what is accepted for errors of the model to be looked for in it."""
 _ROUNDS = 3
 """Fits with errors of the model: each learns from the one before."""
 _SHEAR_SHOWS = 4.0
@@ -71,7 +73,8 @@ def polished(task: Task, solution: Solution) -> Solution:
     if error is not None and error != best.stamp_error:
         best = replace(best, stamp_error=error)
         best = full_fit(task, best, fitted_sigma(task, best), shear=task.may_shear)
-    if task.observation.optics.misfit_is_noise:
+    hopeless = best.cost > _HOPELESS * task.acceptance.chi2_per_dof * best.model.pixels
+    if task.observation.optics.misfit_is_noise and not hopeless:
         best = _with_model_error(task, best)
         task = replace(task, observation=best.model.observation)
     if task.shear is None and not _shear_shows(best):

@@ -181,10 +181,10 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
 
         # A worker that is killed charges the one run that was on it; the nanny starts it anew. In the moment of the
         # kill it may be between two runs, and nobody is charged: then again.
-        third = submit(grids, 60, seed=200)
+        third = submit(grids, 120, seed=200)
         kills = 0
         while not outcomes(database)["worker_lost"]:
-            assert kills < 5, "a worker was killed five times and no run was charged"
+            assert kills < 12, "a worker was killed twelve times and no run was charged"
             eventually(lambda: ready(2) and grids.grid(third).counts.leased >= 2, _PATIENCE_S, "runs in flight")
             (victim, *_) = eventually(partial(worker_processes, workers[0]), _PATIENCE_S, "its process")
             victim.kill()
@@ -195,11 +195,15 @@ def test_workers_started_elsewhere_do_the_work_over_tls_and_every_loss_of_theirs
                 _PATIENCE_S,
                 "a charge or another worker",
             )
-        rest = (second, third)
-        eventually(lambda: all(grids.grid(one).counts.done == 60 for one in rest), _PATIENCE_S, "the other grids")
+        rest = {second: 60, third: 120}
+        eventually(
+            lambda: all(grids.grid(one).counts.done == runs for one, runs in rest.items()),
+            _PATIENCE_S,
+            "the other grids",
+        )
         assert set(outcomes(database)) <= {"done", "worker_lost", "scheduler_lost", "forgotten"}
         assert 1 <= outcomes(database)["worker_lost"] <= kills
-        assert outcomes(database)["done"] == 132
+        assert outcomes(database)["done"] == 192
         dispatcher.terminate()
         assert dispatcher.wait(timeout=_PATIENCE_S) == 0
 
