@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -17,6 +18,7 @@ from typing import NoReturn
 CONFIGURATION = 2
 """Exit code of what is asked for and cannot be: another start would end in the same way."""
 STOPS = (signal.SIGINT, signal.SIGTERM)
+_AGAIN_S = 0.05
 _left_behind: list[Callable[[], None]] = []
 
 
@@ -46,13 +48,33 @@ def finish(*, service: bool) -> None:
 
 
 def interruptible() -> None:
-    """From now on a signal unwinds what a command is at, so that it can clean up."""
+    """From now on a signal unwinds what a command is at, so that it can clean up.
 
-    def terminated(_number: int, _frame: FrameType | None) -> NoReturn:
-        sys.exit(128 + signal.SIGTERM)
+    Not while a module is being loaded: libraries swallow exceptions there, as pydantic's core does while it builds a
+    schema. The signal then comes again a moment later.
+    """
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, terminated)
+    def interrupted(number: int, frame: FrameType | None) -> None:
+        if _loading(frame):
+            again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+        elif number == signal.SIGINT:
+            raise KeyboardInterrupt
+        else:
+            sys.exit(128 + number)
+
+    for number in STOPS:
+        signal.signal(number, interrupted)
+
+
+def _loading(frame: FrameType | None) -> bool:
+    """Whether a module is being loaded where a frame stands."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def on_early_end(end: Callable[[], None]) -> None:
