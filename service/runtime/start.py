@@ -19,6 +19,8 @@ CONFIGURATION = 2
 """Exit code of what is asked for and cannot be: another start would end in the same way."""
 STOPS = (signal.SIGINT, signal.SIGTERM)
 _AGAIN_S = 0.05
+_LOADERS = ("<frozen importlib", "/llvmlite/", "/numba/")
+"""Parts of the names of files whose code loads what a program is made of."""
 _left_behind: list[Callable[[], None]] = []
 
 
@@ -50,8 +52,8 @@ def finish(*, service: bool) -> None:
 def interruptible() -> None:
     """From now on a signal unwinds what a command is at, so that it can clean up.
 
-    Not while a module is being loaded: libraries swallow exceptions there, as pydantic's core does while it builds a
-    schema. The signal then comes again a moment later.
+    Not while a module or a compiled kernel is being loaded: what is raised there is swallowed by pydantic's core, which
+    builds schemas, and by llvmlite's callbacks. The signal then comes again a moment later.
     """
 
     def interrupted(number: int, frame: FrameType | None) -> None:
@@ -69,9 +71,9 @@ def interruptible() -> None:
 
 
 def _loading(frame: FrameType | None) -> bool:
-    """Whether a module is being loaded where a frame stands."""
+    """Whether a module or a compiled kernel is being loaded where a frame stands."""
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
+        if any(part in frame.f_code.co_filename for part in _LOADERS):
             return True
         frame = frame.f_back
     return False
