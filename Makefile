@@ -11,7 +11,7 @@ INSTALL := PIP_CONSTRAINT=constraints.txt PIP_DISABLE_PIP_VERSION_CHECK=1 $(BIN)
 help:
 	@echo "make demo        four runs of HE0435-1223 through the whole system, with a table of biases"
 	@echo "make serve       run the service until Ctrl-C"
-	@echo "make test        ruff, mypy and the tests: about twelve minutes on two cores"
+	@echo "make test        ruff, mypy and the tests: about thirteen minutes on two cores"
 	@echo "make check-long  the tests that take hours: full-size drills, 100,000 steps of the queue, 10,000 lenses"
 	@echo "make lint        ruff and mypy"
 	@echo "make bench       benchmarks: the answer asserted, then the time as a ratio to a peer"
