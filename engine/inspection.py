@@ -69,7 +69,9 @@ def inspect_inversion(
         fit = fit or fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
         problem = prepare_problem(observation, fit, analysis)
         target = prepare_target(problem, fit, analysis)
-        optimum = find_optimum(target, *find_start(target, fit))
+        # A third of a deviation may be left the first time, which is enough to begin a chain and not to be looked at.
+        near = find_optimum(target, *find_start(target, fit))
+        optimum = find_optimum(target, near.mean, near.covariance)
         inversion = target.invert(optimum.mean)
         names = target.prior.names
         image_plane, chi2 = inverted_image(observation, problem, inversion)
