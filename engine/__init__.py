@@ -51,6 +51,7 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import PROFILES, Analysis
+from engine.spec.host import Host
 from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.json_text import read_json
 from engine.spec.priors import ParameterPrior
@@ -62,7 +63,7 @@ from engine.spec.realization import (
     spec_digest,
     system_from_mapping,
 )
-from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.sky import LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 from engine.stages import ACCURACY_STAGES, STAGES
 from engine.user_files import read_camera, read_mapping, read_system

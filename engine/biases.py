@@ -42,14 +42,19 @@ class Setting(NamedTuple):
 
     l_eta: float
     r_eff: float
-    n: float
+    n: float | None
+
+    def order(self) -> tuple[float, float, float]:
+        """What settings are sorted by: hosts without an index come last."""
+        return self.l_eta, self.r_eff, math.inf if self.n is None else self.n
 
 
 @dataclass(frozen=True)
 class BiasPoint:
     """One estimate of the host of one simulated run, beside what was put in.
 
-    ``n``, ``r_eff`` [arcsec], ``magnitude`` [AB] and ``l_eta`` are the input, ``seed`` that of the noise.
+    ``n`` (None of a host that is no Sersic profile), ``r_eff`` [arcsec], ``magnitude`` [AB] and ``l_eta`` are the
+    input, ``seed`` that of the noise.
     ``recovered`` holds each quantity with its truth. ``arc_magnitude``, ``agn_contrast`` (None without AGN) and
     ``surface_brightness`` as in :class:`~engine.result.RunResult`.
     """
@@ -57,7 +62,7 @@ class BiasPoint:
     run_id: str
     system: str
     configuration: Configuration
-    n: float
+    n: float | None
     r_eff: float
     magnitude: float
     l_eta: float
@@ -122,7 +127,7 @@ def serial_numbers(points: Iterable[BiasPoint]) -> dict[Setting, int]:
 
     Of one system's whole grid of the paper these are the numbers of its Table 3.
     """
-    return {setting: number for number, setting in enumerate(sorted({point.setting for point in points}), 1)}
+    return {setting: number for number, setting in enumerate(sorted({point.setting for point in points}, key=Setting.order), 1)}
 
 
 def group_points(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[BiasPoint, ...]]:
@@ -135,12 +140,13 @@ def group_points(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[B
     """
     if by not in GROUPINGS:
         raise FigureError(f"group by: got {by!r}, allowed is one of {list(GROUPINGS)}")
-    groups: dict[str | float, list[BiasPoint]] = {}
+    groups: dict[str | float | None, list[BiasPoint]] = {}
     for point in points:
         groups.setdefault(getattr(point, by), []).append(point)
     return {
-        key if isinstance(key, str) else f"{by} {key:g}": tuple(groups[key])
-        for key in sorted(groups)  # of one kind: a column is text or numbers
+        key if isinstance(key, str) else f"{by} none" if key is None else f"{by} {key:g}": tuple(groups[key])
+        # Of one kind, a column is text or numbers; what has no number comes last.
+        for key in sorted(groups, key=lambda key: (key is None, key))
     }
 
 

@@ -23,10 +23,11 @@ from engine.catalogue import (
 )
 from engine.errors import SpecError
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.instrument import Camera, CameraChoice, Dither, NoiseLevel, Optics
 from engine.spec.quantities import Count, Identifier, Magnitude, Radius, SersicIndex, Slope
 from engine.spec.realization import Realization
-from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.sky import LensSystem, SystemChoice
 
 PAPER = "h0licow-vi"
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)

@@ -34,7 +34,7 @@ _ROUND = 1e-7
 
 @dataclass(frozen=True)
 class Multipole:
-    """A departure of order ``m`` of isodensity contours, ``amplitude`` times their radius, greatest at angle ``phi``."""
+    """Isodensity contours depart, in order ``m``, by ``amplitude`` times their radius, most outwards at ``phi`` [rad]."""
 
     m: int
     amplitude: float

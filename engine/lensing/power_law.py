@@ -14,7 +14,7 @@ below |a_K| f / (1 - f), and the count is chosen to bring that bound below round
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +56,7 @@ class PowerLawLens:
     y: float = 0.0
     gamma1: float = 0.0
     gamma2: float = 0.0
-    perturbers: tuple[Perturber, ...] = ()
+    perturbers: tuple[Perturber, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse what the formulas do not cover."""
@@ -77,7 +77,7 @@ class PowerLawLens:
 
     def with_values(self, **values: float) -> PowerLawLens:
         """A copy with some parameters replaced."""
-        return replace(self, **values)
+        return replace(self, **values)  # type: ignore[arg-type]  # none of them is the perturbers
 
 
 def series_coefficients(q: float, t: float, tolerance: float = SERIES_TOLERANCE) -> FloatArray:

@@ -18,7 +18,7 @@ from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.priors import ParameterPrior
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
+from engine.spec.host import Host
 from tests.engine.conftest import HELD_INDEX, cut
 
 N = COORDINATES.index("n")

@@ -26,7 +26,7 @@ from engine.posterior.start import prepare_target
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import Analysis
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
+from engine.spec.host import Host
 from tests.engine.conftest import cut
 
 SAME = 0.05

@@ -12,7 +12,7 @@ from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.instrument import Camera
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
+from engine.spec.host import Host
 
 SHARED_DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 
