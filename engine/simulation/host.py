@@ -7,26 +7,16 @@ from functools import lru_cache
 
 from engine.conventions import image_angle, magnitude_to_rate
 from engine.errors import SpecError
-from engine.light.galaxy import Galaxy, Light, galaxy_of, half_light_ellipse
+from engine.light.galaxy import Galaxy, Light, galaxy_of
 from engine.light.pixels import PixelLight
 from engine.light.sersic import SersicProfile
 from engine.simulation.made import made_components
 from engine.spec.host import Host, HostImage, HostShape
 from engine.spec.sky import LensSystem
 
-_LEAST_RADIUS = 1.5
-_MOST_RADIUS = 0.4
-"""Half-light radius of an image: at least so many pixels, at most so much of its shorter side."""
-
 
 def host_light(host: Host, system: LensSystem, zero_point: float, x: float, y: float) -> Light:
-    """A host with its centre or nucleus at (x, y) [arcsec]: a Sersic profile, or a galaxy.
-
-    Raises
-    ------
-    SpecError
-        An image is no galaxy that a half-light radius can be told of.
-    """
+    """A host with its centre or nucleus at (x, y) [arcsec]: a Sersic profile, or a galaxy."""
     angle = system.host_position_angle if host.position_angle is None else host.position_angle
     q = system.host_q if host.q is None else host.q
     flux = magnitude_to_rate(host.magnitude, zero_point)
@@ -48,22 +38,6 @@ def _galaxy(shape: HostShape, q: float, angle: float, flux: float, r_eff: float,
 
 
 def image_component(image: HostImage, angle: float) -> PixelLight:
-    """An image with pixels of unit side, turned by ``angle`` [deg] East of North, its nucleus at the origin.
-
-    Raises
-    ------
-    SpecError
-        The galaxy is too small or too large for its image.
-    """
-    values = image.array()
+    """An image with pixels of unit side, turned by ``angle`` [deg] East of North, its nucleus at the origin."""
     # Rows from the South, West on the right: the image frame has x to the West and y to the North.
-    light = PixelLight(values, 1.0, *image.nucleus, phi=math.radians(angle))
-    radius, _, _ = half_light_ellipse((light,), min(values.shape) / 6.0)
-    most = _MOST_RADIUS * min(values.shape)
-    if not _LEAST_RADIUS <= radius <= most:
-        raise SpecError(
-            "host.image",
-            f"a half-light radius of {radius:.1f} pixels",
-            f"{_LEAST_RADIUS:g} to {most:g} pixels in an image of {values.shape[0]} x {values.shape[1]}",
-        )
-    return light
+    return PixelLight(image.array(), 1.0, *image.nucleus, phi=math.radians(angle))

@@ -33,6 +33,9 @@ _MOST_TEXT = 4 * -(-(4 * MOST_SIDE**2) // 3)
 _PEDESTAL = 0.1
 """Share of the light that a pedestal under the whole image may have."""
 
+_LEAST_RADIUS, _MOST_RADIUS = 1.5, 0.4
+"""Half-light radius of a galaxy: so many pixels at least, so much of the shorter side at most."""
+
 Label = Annotated[str, Field(min_length=1, max_length=32, pattern=IDENTIFIER)]
 HostKind = Literal["sersic", "image", "bulge_disc", "clumpy", "companion", "spiral", "irregular", "merger"]
 MadeKind = Literal["bulge_disc", "clumpy", "companion", "spiral", "irregular", "merger"]
@@ -78,6 +81,12 @@ class HostImage:
         (rows, columns), (column, row) = self.shape, self.nucleus
         if column > columns - 1 or row > rows - 1:
             raise SpecError("nucleus", self.nucleus, f"a place within {columns} columns and {rows} rows")
+        radius, most = _half_light_radius(values, column, row), _MOST_RADIUS * min(self.shape)
+        if not _LEAST_RADIUS <= radius <= most:
+            raise SpecError(
+                "pixels", f"half of the light within {radius:.1f} pixels of the nucleus",
+                f"{_LEAST_RADIUS:g} to {most:g} pixels, or the galaxy is not resolved, or not all there",
+            )  # fmt: skip
         return self
 
     def array(self) -> FloatArray:
@@ -96,6 +105,15 @@ class HostImage:
         """SHA-256 (hex) of the pixels, their number along each side and the place of the nucleus."""
         named = f"{self.shape[0]} {self.shape[1]} {self.nucleus[0]!r} {self.nucleus[1]!r} {self.pixels}"
         return hashlib.sha256(named.encode()).hexdigest()
+
+
+def _half_light_radius(values: FloatArray, column: float, row: float) -> float:
+    """Radius of the circle [pixels] that holds half of the sum, to half a pixel."""
+    j, i = np.indices(values.shape)
+    radius = np.hypot(i - column, j - row).ravel()
+    order = np.argsort(radius, kind="stable")
+    light = np.cumsum(values.ravel()[order])
+    return float(radius[order][np.argmax(light >= 0.5 * light[-1])])
 
 
 def border_of(values: FloatArray) -> FloatArray:
