@@ -25,10 +25,12 @@ from engine.errors import (
     SpecError,
 )
 from engine.grid import (
+    Deflectors,
     Expansion,
     FirstSeed,
     Grid,
     GridRun,
+    Hosts,
     Indices,
     Magnitudes,
     Radii,
@@ -51,7 +53,8 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import PROFILES, Analysis
-from engine.spec.host import Host
+from engine.spec.deflector import USUAL_DEFLECTOR, Deflector
+from engine.spec.host import Host, HostImage, HostShape, MadeGalaxy
 from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.json_text import read_json
 from engine.spec.priors import ParameterPrior
@@ -100,6 +103,7 @@ if TYPE_CHECKING:
     )
     from engine.comparison import compare
     from engine.experiment import inspect_simulation, run
+    from engine.host_files import read_host_image
     from engine.imaging.external import observation_from_arrays
     from engine.imaging.external_files import read_external_observation
     from engine.imaging.fits import read_observation, write_observation
@@ -125,6 +129,7 @@ else:
         ),
         "engine.comparison": "compare",
         "engine.experiment": "inspect_simulation run",
+        "engine.host_files": "read_host_image",
         "engine.imaging.external": "observation_from_arrays",
         "engine.imaging.external_files": "read_external_observation",
         "engine.imaging.fits": "read_observation write_observation",
@@ -161,6 +166,7 @@ __all__ = [
     "PROFILES",
     "STAGES",
     "TRENDS",
+    "USUAL_DEFLECTOR",
     "AccuracyError",
     "AccuracyReport",
     "Analysis",
@@ -171,6 +177,8 @@ __all__ = [
     "ChainSummary",
     "Configuration",
     "CoverageCurve",
+    "Deflector",
+    "Deflectors",
     "EngineError",
     "Estimate",
     "Expansion",
@@ -180,7 +188,10 @@ __all__ = [
     "GridRun",
     "Grouping",
     "Host",
+    "HostImage",
     "HostQuantity",
+    "HostShape",
+    "Hosts",
     "Identifier",
     "ImageMeasurement",
     "ImagePlane",
@@ -190,6 +201,7 @@ __all__ = [
     "LensEquationError",
     "LensParameter",
     "LensSystem",
+    "MadeGalaxy",
     "Magnitudes",
     "NoiseFromImage",
     "NoiseLevel",
@@ -254,6 +266,7 @@ __all__ = [
     "pull_summary",
     "read_camera",
     "read_external_observation",
+    "read_host_image",
     "read_json",
     "read_mapping",
     "read_observation",

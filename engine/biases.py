@@ -127,7 +127,10 @@ def serial_numbers(points: Iterable[BiasPoint]) -> dict[Setting, int]:
 
     Of one system's whole grid of the paper these are the numbers of its Table 3.
     """
-    return {setting: number for number, setting in enumerate(sorted({point.setting for point in points}, key=Setting.order), 1)}
+    return {
+        setting: number
+        for number, setting in enumerate(sorted({point.setting for point in points}, key=Setting.order), 1)
+    }
 
 
 def group_points(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[BiasPoint, ...]]:

@@ -94,9 +94,7 @@ def _read(path: Path, extension: str | int | None) -> FloatArray:
             images = {i: hdu for i, hdu in enumerate(file) if getattr(hdu, "data", None) is not None and hdu.is_image}
             names = [f"{i}{f' ({hdu.name})' if hdu.name else ''}" for i, hdu in images.items()]
             wanted = [
-                hdu
-                for i, hdu in images.items()
-                if extension is None or str(extension) in {str(i), hdu.name.strip()}
+                hdu for i, hdu in images.items() if extension is None or str(extension) in {str(i), hdu.name.strip()}
             ]
             if len(wanted) != 1:
                 raise SpecError("extension", extension, f"one of the images {names or 'that the file has not'}")

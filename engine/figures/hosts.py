@@ -19,7 +19,7 @@ _ROW = 6
 
 
 def hosts_figure(simulations: Sequence[Simulation]) -> Figure:
-    """Each simulation's host in the source plane, to four half-light radii, and below it its arc, drizzled, without noise.
+    """Each simulation's host in the source plane, to four half-light radii, and below it its drizzled arc without noise.
 
     Galaxies have an asinh stretch to their brightest cell, linear within a hundredth of it; arcs one in units of the
     noise of the empty sky.
@@ -42,7 +42,13 @@ def hosts_figure(simulations: Sequence[Simulation]) -> Figure:
         above.set_axis_on()
         below.set_axis_on()
         show(above, galaxy, side, stretch(peak / 300.0, peak), _RADII * host.r_eff)
-        show(below, simulation.arc / sigma, observation.pixel_scale, stretch(1.0, float(simulation.arc.max()) / sigma), half)
+        show(
+            below,
+            simulation.arc / sigma,
+            observation.pixel_scale,
+            stretch(1.0, float(simulation.arc.max()) / sigma),
+            half,
+        )
         above.set_title(str(observation.provenance["HOST"]), fontsize=8.5)
         corner_label(above, f"q {host.q:.2f}", fontsize=7)
         scale_bar(above, _RADII * host.r_eff, fontsize=7)

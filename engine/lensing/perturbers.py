@@ -34,7 +34,7 @@ _ROUND = 1e-7
 
 @dataclass(frozen=True)
 class Multipole:
-    """Isodensity contours depart, in order ``m``, by ``amplitude`` times their radius, most outwards at ``phi`` [rad]."""
+    """Isodensity contours depart in order ``m`` by ``amplitude`` times their radius, most outwards at ``phi`` [rad]."""
 
     m: int
     amplitude: float

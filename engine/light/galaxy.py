@@ -211,9 +211,7 @@ def half_light_ellipse(components: Sequence[Component], scale: float) -> tuple[f
 
 def galaxy_of(parts: Sequence[Component], flux: float, r_eff: float, x: float, y: float) -> Galaxy:
     """Components about the origin as a galaxy: in proportion, with a flux [e-/s] and half-light radius [arcsec]."""
-    sizes = (
-        one.r_eff if isinstance(one, SersicProfile) else one.side * min(one.values.shape) / 6 for one in parts
-    )
+    sizes = (one.r_eff if isinstance(one, SersicProfile) else one.side * min(one.values.shape) / 6 for one in parts)
     radius, q, phi = half_light_ellipse(parts, max(sizes))
     stretch, brighter = r_eff / radius, flux / sum(one.flux for one in parts)
     return Galaxy(tuple(_scaled(one, stretch, brighter, x, y) for one in parts), r_eff, q, phi, x, y)
