@@ -98,8 +98,8 @@ class Expansion:
     """The runs of a grid in a fixed order: checked and counted at once, made one by one as they are asked for.
 
     ``samples`` has one run of each system at each slope with each deflector, ``shares`` how many of the runs each
-    stands for. What these and the values of the lists are refused for is all that a run can be refused for, so neither time nor memory grows
-    with the number of runs. A SpecError says which value is not allowed and what is.
+    stands for. What these and the values of the lists are refused for is all that a run can be refused for, so neither
+    time nor memory grows with the number of runs. A SpecError says which value is not allowed and what is.
     """
 
     def __init__(self, grid: Grid) -> None:

@@ -19,7 +19,7 @@ _ROW = 6
 
 
 def hosts_figure(simulations: Sequence[Simulation]) -> Figure:
-    """Each simulation's host in the source plane, to four half-light radii, and below it its drizzled arc without noise.
+    """Each simulation's host in the source plane, to four half-light radii, and below it its drizzled arc, noiseless.
 
     Galaxies have an asinh stretch to their brightest cell, linear within a hundredth of it; arcs one in units of the
     noise of the empty sky.

@@ -38,6 +38,7 @@ def multipole_potential(one: Multipole, x: np.ndarray, y: np.ndarray) -> np.ndar
     t, m = MAIN.slope - 1.0, one.m
     out = []
     for r, angle in zip(np.hypot(x - MAIN.x, y - MAIN.y), np.arctan2(y - MAIN.y, x - MAIN.x), strict=True):
+
         def kappa(s: float) -> float:
             return 0.5 * (2.0 - t) * (MAIN.theta_E / s) ** t * t * one.amplitude
 
@@ -150,7 +151,8 @@ def test_all_images_are_found(name: str) -> None:
 
 
 def _cells_with_source(bx: np.ndarray, by: np.ndarray, sx: float, sy: float) -> list[tuple[int, int]]:
-    corners = [(bx[:-1, :-1], by[:-1, :-1]), (bx[:-1, 1:], by[:-1, 1:]), (bx[1:, 1:], by[1:, 1:]), (bx[1:, :-1], by[1:, :-1])]
+    low, high = slice(None, -1), slice(1, None)
+    corners = [(bx[j, i], by[j, i]) for j, i in ((low, low), (low, high), (high, high), (high, low))]
     inside = np.zeros(bx[:-1, :-1].shape, dtype=bool)
     for order in ((0, 1, 2), (0, 2, 3)):
         sides = []
