@@ -100,13 +100,19 @@ def check_deflector(realization: Realization) -> None:
     if realization.deflector is None or not system.agn:
         return
     mass = system.mass_model(realization.mass_model, realization.l_eta)
-    lens = power_law_lens(mass, realization.deflector)
+    lens, label = power_law_lens(mass, realization.deflector), realization.deflector.label
     try:
-        _bright_images(lens, source_place(mass, lens), len(system.agn))
-    except (SpecError, LensEquationError) as error:
+        images = _bright_images(lens, source_place(mass, lens), len(system.agn))
+    except LensEquationError as error:
+        raise SpecError("deflector", label, f"one whose images can be found: {error}") from error
+    if len(images) != len(system.agn):
+        sizes = ", ".join(f"{abs(one.magnification):.2f}" for one in images)
         raise SpecError(
-            "deflector", realization.deflector.label, f"one that leaves {system.name} its images: {error}"
-        ) from error
+            "deflector",
+            label,
+            f"one that leaves {system.name} its {len(system.agn)} images of the AGN; this makes {len(images)}, of "
+            f"magnifications {sizes}",
+        )
 
 
 def _bright_images(lens: PowerLawLens, place: tuple[float, float], number: int) -> tuple[LensedImage, ...]:
@@ -211,6 +217,7 @@ def place_agn(
 
 def build_scene(realization: Realization) -> Scene:
     """The scene of a realization."""
+    check_deflector(realization)
     system, camera = resolve_system(realization), resolve_camera(realization)
     mass = system.mass_model(realization.mass_model, realization.l_eta)
     lens = power_law_lens(mass, realization.deflector)

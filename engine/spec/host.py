@@ -16,6 +16,7 @@ from engine.conventions import FloatArray
 from engine.errors import SpecError
 from engine.spec.quantities import (
     STRICT,
+    UNSIGNED,
     Angle,
     AxisRatio,
     Count,
@@ -40,7 +41,7 @@ Label = Annotated[str, Field(min_length=1, max_length=32, pattern=IDENTIFIER)]
 HostKind = Literal["sersic", "image", "bulge_disc", "clumpy", "companion", "spiral", "irregular", "merger"]
 MadeKind = Literal["bulge_disc", "clumpy", "companion", "spiral", "irregular", "merger"]
 Side = Annotated[Count, Field(ge=LEAST_SIDE, le=MOST_SIDE)]
-Pixel = Annotated[Number, Field(ge=0.0, le=float(MOST_SIDE))]
+Pixel = Annotated[Number, Field(ge=0.0, le=float(MOST_SIDE)), UNSIGNED]
 
 _USUAL: dict[str, dict[str, float]] = {
     "bulge_disc": {"share": 0.3, "size": 0.2},
