@@ -78,7 +78,7 @@ def measure(
     with refusals():
         from rich.console import Console  # noqa: PLC0415 - help needs none
 
-        observation = _observation(
+        observation = observation_of_files(
             image, psf, trust_options=trust_options, noise=noise, pixel_scale=pixel_scale, zero_point=zeropoint,
             mask=mask, dq=dq, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation,
             sky_rms_e_s=sky_rms, good_bits=good_bits, center=center, size=size, extension=extension,
@@ -111,7 +111,7 @@ def _short(value: str | float) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _observation(image: Path, psf: Path | None, *, trust_options: bool, **how: Any) -> Observation:
+def observation_of_files(image: Path, psf: Path | None, *, trust_options: bool, **how: Any) -> Observation:
     """Our own FITS file as it is, or anybody's from its parts; ``how`` is None where nothing is given."""
     if psf is None:
         return _own_observation(image, [name for name, value in how.items() if value is not None])
