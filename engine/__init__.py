@@ -97,6 +97,7 @@ if TYPE_CHECKING:
         serial_numbers,
         trend_series,
     )
+    from engine.calibration import Calibration, calibrate
     from engine.codes.compare import Comparison, compare_codes
     from engine.codes.coolest import write_coolest
     from engine.comparison import compare
@@ -124,6 +125,7 @@ else:
             "HostQuantity PullSummary Spread Trend TrendBin TrendSeries bias_points configuration_of "
             "coverage_curve group_points mean_bias pull_summary serial_numbers trend_series"
         ),
+        "engine.calibration": "Calibration calibrate",
         "engine.codes.compare": "Comparison compare_codes",
         "engine.codes.coolest": "write_coolest",
         "engine.comparison": "compare",
@@ -169,6 +171,7 @@ __all__ = [
     "Analysis",
     "Aperture",
     "BiasPoint",
+    "Calibration",
     "Camera",
     "CameraChoice",
     "ChainSummary",
@@ -229,6 +232,7 @@ __all__ = [
     "accuracy_rows",
     "analyse",
     "bias_points",
+    "calibrate",
     "camera_from_mapping",
     "camera_names",
     "check_analysis",
