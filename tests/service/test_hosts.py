@@ -93,7 +93,7 @@ def test_hosts_and_deflectors_are_stored_grouped_and_filtered_by(api: TestClient
     ]
     # Of the index only what has one has biases, and the answer to a question about it is not refused.
     of_n = {row["group"]["host_kind"]: row["bias"] for row in rows(group_by="host_kind", quantity="n")}
-    assert (of_n["image"], of_n["spiral"], of_n["sersic"]["n"]) == (None, None, 4)
+    assert (of_n["image"], of_n["spiral"], of_n["sersic"]["runs"]) == (None, None, 4)
     by_n = rows(group_by="n")
     assert [row["group"]["n"] for row in by_n] == [2.0, None]
     # The link to a group's results has the group's runs.
