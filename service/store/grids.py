@@ -24,6 +24,7 @@ from sqlalchemy.exc import IntegrityError
 
 from service.domain.identifiers import utc_now
 from service.domain.plan import Plan
+from service.domain.precision import Until
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.domain.views import GridKind, GridPage, GridView
 from service.store.database import Database
@@ -91,6 +92,7 @@ class GridStore(RunStore):
         engine: str | None = None,
         owner: str | None = None,
         expected_wall_s: Callable[[], float | None] = lambda: None,
+        until: Until | None = None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
@@ -98,7 +100,8 @@ class GridStore(RunStore):
         with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
         ``engine`` is the digest of the engine whose results the grid takes, any where None; a key is its
         ``owner``'s: of another one it is another request. ``expected_wall_s`` is what its runs should take on one
-        worker, asked as ``plan`` is.
+        worker, asked as ``plan`` is. ``until`` ends replicates: the plan has ``at_most`` of each point, the first of all
+        points before the second of any.
 
         Raises
         ------
@@ -118,7 +121,7 @@ class GridStore(RunStore):
             with self._database.write() as connection:
                 give_up(connection, known.id, self._clock())
             known = None
-        new = Submission(request, canonical, name, key, engine, self._clock(), owner)
+        new = Submission(request, canonical, name, key, engine, self._clock(), owner, until=until)
         if known is None:
             new = replace(new, expected_wall_s=expected_wall_s())
             try:
