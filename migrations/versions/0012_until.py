@@ -45,8 +45,8 @@ def upgrade():
 def downgrade():
     # To the older code they are runs that nobody wants any more; what it wrote down of their grids it counts anew.
     spared = "select grid_id from run where state = 'not_needed'"
+    op.execute(f"update grid set ending = null where id in ({spared})")  # noqa: S608
     op.execute(f"update grid set state = 'cancelled' where state = 'done' and id in ({spared})")  # noqa: S608
-    op.execute("update grid set ending = null where until is not null")
     op.execute("update run set state = 'cancelled' where state = 'not_needed'")
     op.drop_table("point")
     _allow_states(STATES)

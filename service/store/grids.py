@@ -32,6 +32,7 @@ from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent, recent_of
 from service.store.pieces import PIECE, Turns
+from service.store.points import progress
 from service.store.rows import (
     ended_grid_view,
     grid_view,
@@ -300,7 +301,8 @@ class GridStore(RunStore):
         counts = {str(state): row._mapping[f"{state}_runs"] for state in RunState}
         latest = recent_of(connection, grid_id)
         workers = _workers(connection) if latest is None and row.expected_wall_s is not None else 0
-        return grid_view(row, counts, latest, self._clock(), workers)
+        far = progress(connection, _with_rule([row])).get(row.id)
+        return grid_view(row, counts, latest, self._clock(), workers, far)
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()
@@ -311,12 +313,18 @@ class GridStore(RunStore):
             counts[row.grid_id][row.state] = row.runs
         latest = recent(connection, ids) if ids else {}
         workers = _workers(connection) if len(latest) < len(ids) else 0
+        far = progress(connection, _with_rule([row for row in rows if row.ending is None]))
         return [
-            grid_view(row, counts[row.id], latest.get(row.id), now, workers)
+            grid_view(row, counts[row.id], latest.get(row.id), now, workers, far.get(row.id))
             if row.ending is None
             else ended_grid_view(row)
             for row in rows
         ]
+
+
+def _with_rule(rows: Sequence[Row[Any]]) -> dict[str, tuple[int, int]]:
+    """Points and most replicates of those grids that end replicates."""
+    return {row.id: (row.points, row.until["at_most"]) for row in rows if row.until is not None}
 
 
 def _workers(connection: Connection) -> int:

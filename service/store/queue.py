@@ -49,6 +49,7 @@ from service.store.leases import (
     requeue,
     set_aside,
 )
+from service.store.points import Replicate, judge_points
 from service.store.results import estimate_rows, measurement_row, result_row
 from service.store.settling import held_grids
 from service.store.sums import add_to_inputs, add_to_moments
@@ -423,9 +424,9 @@ _CLAIMED = (
 def _insert_results(connection: Connection, results: Sequence[tuple[Lease, ResultPayload]], now: datetime) -> None:
     """Write results of realizations with all that is added up from them."""
     ids = [lease.run_id for lease, _ in results]
-    asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
-    inputs = {row.id: row.inputs for row in asked}
-    stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
+    asked = connection.execute(select(run.c.id, run.c.ordinal, run.c.inputs).where(run.c.id.in_(ids)))
+    runs = {row.id: row for row in asked}
+    stored = [result_row(lease, runs[lease.run_id].inputs, payload, now) for lease, payload in results]
     for row, input_id in zip(stored, add_to_inputs(connection, stored), strict=True):
         row["input_id"] = input_id
     answers = [
@@ -437,6 +438,9 @@ def _insert_results(connection: Connection, results: Sequence[tuple[Lease, Resul
     if answers:
         insert_rows(connection, estimate, answers)
     add_to_moments(connection, stored, answers)
+    judge_points(
+        connection, [Replicate(row["grid_id"], runs[row["run_id"]].ordinal, row["input_id"]) for row in stored], now
+    )
 
 
 def _read_spec(text: str) -> dict[str, Any] | None:
