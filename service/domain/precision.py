@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
-from typing import Annotated, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 LEAST = 3
 """Replicates below which their scatter says nothing."""
+_AT_LEAST = 10
 MOST = 5000
 """Replicates of a point: as many runs as one statement may name."""
 
@@ -40,10 +41,14 @@ class Until(BaseModel):
     error: Annotated[float, Field(gt=0.0, le=100.0, strict=True)]
     """Of the mean bias: mag, arcsec, or in n."""
     at_most: Annotated[int, Field(ge=LEAST, le=MOST, strict=True)] = 100
-    at_least: Annotated[
-        int, Field(ge=LEAST, le=MOST, strict=True, default_factory=lambda given: min(10, given.get("at_most", 10)))
-    ]
-    """10 without, or ``at_most`` where that is less."""
+    at_least: Annotated[int, Field(ge=LEAST, le=MOST, strict=True)] = _AT_LEAST
+    """Without, ``at_most`` where that is less."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_more_than_there_are(cls, given: Any) -> Any:
+        most = given.get("at_most") if isinstance(given, Mapping) and "at_least" not in given else None
+        return {**given, "at_least": most} if isinstance(most, int) and LEAST <= most < _AT_LEAST else given
 
     def is_kept(self, standard_error: float | None, runs: int) -> bool:
         """Whether the mean of so many biases is known well enough."""

@@ -36,12 +36,13 @@ class Replicate(NamedTuple):
     input_id: int
 
 
-def judge_points(connection: Connection, stored: Sequence[Replicate], now: datetime) -> None:
+def judge_points(connection: Connection, stored: Sequence[Replicate], now: datetime) -> int:
     """Judge the points that results have just been stored of, and end the replicates of those known well enough.
 
-    Only the answers of these points are read. What is running goes on to its end, and is stored. The caller holds the
-    locks of the grids.
+    Returns how many. Only the answers of these points are read. What is running goes on to its end, and is stored. The
+    caller holds the locks of the grids.
     """
+    ended = 0
     wanted = select(grid.c.id, grid.c.until, grid.c.points, grid.c.n_runs)
     ids = sorted({one.grid_id for one in stored})
     for row in connection.execute(wanted.where(grid.c.id.in_(ids), grid.c.points.is_not(None)).order_by(grid.c.id)):
@@ -57,12 +58,13 @@ def judge_points(connection: Connection, stored: Sequence[Replicate], now: datet
         connection.execute(_upsert(connection.dialect.name), rows)
         for place in sorted(reached.keys() - before):
             replicates = range(place, row.n_runs, row.points)
-            spared = move(
-                connection, SPARE, run.c.grid_id == row.id, run.c.ordinal.in_(replicates), finished_at=now
-            )  # fmt: skip
+            mine = (run.c.grid_id == row.id) & run.c.ordinal.in_(replicates)
+            spared = move(connection, SPARE, mine, finished_at=now)
+            ended += len(spared)
             known = {name: judged[place][name] for name in ("runs", "standard_error")}
             told = new_event(row.id, "point_reached", now, place=place, **known, not_needed=len(spared))
             add_events(connection, [told])
+    return ended
 
 
 def _judged(

@@ -200,8 +200,8 @@ class RunQueue:
                 for (lease, payload), is_valid in zip(results, stored, strict=True)
             ]
 
-    @staticmethod
     def _finish(
+        self,
         connection: Connection,
         rows: Sequence[LeasedRow],
         results: Sequence[tuple[Lease, Payload]],
@@ -213,7 +213,7 @@ class RunQueue:
         move(connection, FINISH, run.c.id.in_(ids), finished_at=now, error_code=None, error_detail=None)
         found = [(lease, payload) for lease, payload in results if isinstance(payload, ResultPayload)]
         if found:
-            _insert_results(connection, found, now)
+            self.note_spared(_insert_results(connection, found, now))
         measured = [(lease, payload) for lease, payload in results if isinstance(payload, MeasurementPayload)]
         if measured:
             insert_rows(connection, measurement, [measurement_row(*one, now) for one in measured])
@@ -295,6 +295,9 @@ class RunQueue:
 
     def note_refused(self, runs: int) -> None:
         """So many runs could not go back to the queue and were set aside; for who counts them."""
+
+    def note_spared(self, runs: int) -> None:
+        """So many runs wait no more, since results made them superfluous; for who counts them."""
 
     def set_aside(self, lease: Lease, reason: Exception) -> bool:
         """Quarantine a run whose end the database refuses for what it is; whether the lease was still valid."""
@@ -421,8 +424,8 @@ _CLAIMED = (
 )
 
 
-def _insert_results(connection: Connection, results: Sequence[tuple[Lease, ResultPayload]], now: datetime) -> None:
-    """Write results of realizations with all that is added up from them."""
+def _insert_results(connection: Connection, results: Sequence[tuple[Lease, ResultPayload]], now: datetime) -> int:
+    """Write results of realizations with all that is added up from them; how many others are not needed any more."""
     ids = [lease.run_id for lease, _ in results]
     asked = connection.execute(select(run.c.id, run.c.ordinal, run.c.inputs).where(run.c.id.in_(ids)))
     runs = {row.id: row for row in asked}
@@ -438,9 +441,8 @@ def _insert_results(connection: Connection, results: Sequence[tuple[Lease, Resul
     if answers:
         insert_rows(connection, estimate, answers)
     add_to_moments(connection, stored, answers)
-    judge_points(
-        connection, [Replicate(row["grid_id"], runs[row["run_id"]].ordinal, row["input_id"]) for row in stored], now
-    )
+    replicates = [Replicate(row["grid_id"], runs[row["run_id"]].ordinal, row["input_id"]) for row in stored]
+    return judge_points(connection, replicates, now)
 
 
 def _read_spec(text: str) -> dict[str, Any] | None:
