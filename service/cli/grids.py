@@ -24,7 +24,9 @@ Where = Annotated[
     list[str] | None,
     typer.Option(metavar="AXIS=VALUE", help="As system=HE0435 or magnitude=20..22; may be repeated"),
 ]
-_WATCH = typer.Option("--wait", "--watch", help="Stay until the grid has ended; exit code 1 unless all runs that are needed are stored")
+_WATCH = typer.Option(
+    "--wait", "--watch", help="Stay until the grid has ended; exit code 1 unless all runs that are needed are stored"
+)
 Watch = Annotated[bool, _WATCH]
 
 

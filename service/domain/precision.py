@@ -82,4 +82,4 @@ def upper_limit(standard_error: float | None, runs: int) -> float | None:
     if standard_error is None or runs < LEAST:
         return None
     part = 2.0 / (9.0 * (runs - 1))
-    return standard_error * (1.0 - part - math.sqrt(part)) ** -1.5
+    return standard_error / math.sqrt((1.0 - part - math.sqrt(part)) ** 3)

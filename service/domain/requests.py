@@ -181,7 +181,7 @@ def _require_fitting(request: GridRequest) -> None:
     if until.estimator not in computed:
         raise SpecError("until.estimator", until.estimator, f"one that the analysis computes: {', '.join(computed)}")
     if (until.quantity, until.index_prior) == ("n", "fixed"):
-        raise SpecError("until.index_prior", "fixed", "wide or free where the quantity is n, which has no bias if fixed")
+        raise SpecError("until.index_prior", "fixed", "wide or free, since n has no bias where it is fixed")
 
 
 def _check_own_systems(request: GridRequest) -> None:

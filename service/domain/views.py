@@ -102,7 +102,7 @@ class GridView(_Answer):
     """Runs that ended per second, over the latest hundred; None before the first."""
     eta_seconds: float | None
     """Time left by the rate; before the first run has ended, by stored runs of its kind on the workers of now, and null
-    where there are none. With ``until``, of the replicates that it should take by the scatter of those that there are."""
+    where there are none. With ``until``, of so many replicates as it should take by the scatter of those there are."""
     created_at: datetime
     finished_at: datetime | None
     cancelled_at: datetime | None

@@ -101,8 +101,8 @@ class GridStore(RunStore):
         with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
         ``engine`` is the digest of the engine whose results the grid takes, any where None; a key is its
         ``owner``'s: of another one it is another request. ``expected_wall_s`` is what its runs should take on one
-        worker, asked as ``plan`` is. ``until`` ends replicates: the plan has ``at_most`` of each point, the first of all
-        points before the second of any.
+        worker, asked as ``plan`` is. ``until`` ends replicates: the plan has ``at_most`` of each point, the first
+        of all points before the second of any.
 
         Raises
         ------

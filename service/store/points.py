@@ -12,7 +12,7 @@ from datetime import datetime
 from functools import cache
 from typing import Any, NamedTuple
 
-from sqlalchemy import Connection, Insert, Table, case, func, literal_column, select
+from sqlalchemy import ColumnElement, Connection, Insert, Table, case, func, literal_column, select
 from sqlalchemy.dialects import postgresql, sqlite
 
 from service.domain.precision import Until, standard_error, upper_limit
@@ -67,9 +67,7 @@ def judge_points(connection: Connection, stored: Sequence[Replicate], now: datet
     return ended
 
 
-def _judged(
-    connection: Connection, grid_id: str, until: Until, inputs: Mapping[int, int]
-) -> dict[int, dict[str, Any]]:
+def _judged(connection: Connection, grid_id: str, until: Until, inputs: Mapping[int, int]) -> dict[int, dict[str, Any]]:
     """What is known of each place by now: columns of its row, and whether that is enough."""
     biases: dict[int, list[float]] = defaultdict(list)
     bias = estimate.c[f"{until.quantity}_bias"]
@@ -111,7 +109,9 @@ def _reached(grid_id: str, places: Collection[int]) -> Any:
 def _upsert(dialect: str) -> Insert:
     statement = _INSERT[dialect](point)
     new = statement.excluded
-    changed = {name: new[name] for name in ("input_id", "runs", "standard_error", "wanted")}
+    changed: dict[str, ColumnElement[Any]] = {
+        name: new[name] for name in ("input_id", "runs", "standard_error", "wanted")
+    }
     # The first time stays.
     changed["reached_at"] = func.coalesce(point.c.reached_at, new.reached_at)
     return statement.on_conflict_do_update(index_elements=["grid_id", "place"], set_=changed)

@@ -18,7 +18,6 @@ from typer.testing import CliRunner
 from service.api.app import create_app
 from service.cli.app import app
 from service.cli.formatting import grid_line
-from service.domain.identifiers import utc_now
 from service.domain.payload import ResultPayload
 from service.domain.precision import Until, standard_error, upper_limit
 from service.domain.requests import GridRequest, plan
@@ -72,9 +71,9 @@ DICE = {
     "normal": lambda dice, shape: dice.standard_normal(shape),
     "with tails": lambda dice, shape: dice.standard_t(4, shape) / math.sqrt(2.0),
     "skew": lambda dice, shape: (dice.gamma(2.0, 1.0, shape) - 2.0) / math.sqrt(2.0),
-    "outliers": lambda dice, shape: dice.standard_normal(shape)
-    * np.where(dice.random(shape) < 0.05, 5.0, 1.0)
-    / math.sqrt(0.95 + 0.05 * 25.0),
+    "outliers": lambda dice, shape: (
+        dice.standard_normal(shape) * np.where(dice.random(shape) < 0.05, 5.0, 1.0) / math.sqrt(0.95 + 0.05 * 25.0)
+    ),
 }
 
 
@@ -304,7 +303,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str, str]] = {
         "/until/estimator",
         "image",
     ),
-    "n that is given": ({"until": {"error": 0.1, "quantity": "n", "index_prior": "fixed"}}, "/until/index_prior", "wide"),
+    "n that is given": (
+        {"until": {"error": 0.1, "quantity": "n", "index_prior": "fixed"}},
+        "/until/index_prior",
+        "wide",
+    ),
 }
 
 
