@@ -48,7 +48,7 @@ def judge_points(connection: Connection, stored: Sequence[Replicate], now: datet
     for row in connection.execute(wanted.where(grid.c.id.in_(ids), grid.c.points.is_not(None)).order_by(grid.c.id)):
         inputs = {one.ordinal % row.points: one.input_id for one in stored if one.grid_id == row.id}
         until = Until.model_validate(row.until)
-        judged = _judged(connection, row.id, until, inputs)
+        judged = _judged(connection, until, inputs)
         before = set(connection.scalars(_reached(row.id, inputs)))
         reached = {place: now for place, one in judged.items() if one.pop("is_kept") or place in before}
         rows = [
@@ -67,7 +67,7 @@ def judge_points(connection: Connection, stored: Sequence[Replicate], now: datet
     return ended
 
 
-def _judged(connection: Connection, grid_id: str, until: Until, inputs: Mapping[int, int]) -> dict[int, dict[str, Any]]:
+def _judged(connection: Connection, until: Until, inputs: Mapping[int, int]) -> dict[int, dict[str, Any]]:
     """What is known of each place by now: columns of its row, and whether that is enough."""
     biases: dict[int, list[float]] = defaultdict(list)
     bias = estimate.c[f"{until.quantity}_bias"]

@@ -54,9 +54,8 @@ def bias_map(runs: Iterable[MapRow], most: int) -> BiasMap:
 
 def _cell(run: MapRow) -> Cell:
     if run.state != "done":
-        look = {"leased": "leased", "queued": "queued", "paused": "queued", "not_needed": "queued"}.get(
-            run.state, "failed"
-        )
+        waits = dict.fromkeys(("queued", "paused", "not_needed"), "queued")
+        look = {"leased": "leased", **waits}.get(run.state, "failed")
         return Cell(run.run_id, look, _SIGNS[run.state], f"{run.label}: {run.state.replace('_', ' ')}")
     if run.bias is None:
         return Cell(run.run_id, "z", "?", f"{run.label}: no answer of the recommended estimator")

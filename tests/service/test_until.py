@@ -82,7 +82,7 @@ DICE = {
 def test_means_that_are_said_to_be_known_are_off_by_no_more(kind: str, ratio: float) -> None:
     """Root mean square of mean less truth over 3,000 points that were stopped, with a scatter of ``ratio`` errors.
 
-    1.1 of the error: a skew scatter gives 1.06. Stopping where s / sqrt(n) itself is small gives up to 1.3 (docs). No
+    1.1 of the error: a skew scatter gives 1.05. Stopping where s / sqrt(n) itself is small gives up to 1.3. No
     more than 1.5 times the replicates that one would take who knew the scatter, or those that are the least.
     """
     runs = int(4 * ratio**2) + 60
