@@ -61,8 +61,8 @@ QUEUED, PAUSED, LEASED, DONE, FAILED, QUARANTINED, CANCELLED, NOT_NEEDED = (
     RunState(name)
     for name in ("queued", "paused", "leased", "done", "failed", "quarantined", "cancelled", "not_needed")
 )
-RULES = (None, None, until(0.13, at_most=5), until(0.1, at_most=8), until(1e-9, at_most=3))
-"""Results scatter by 0.1: the first is kept by three or four of them, as a rule, the last by none."""
+RULES = (None, None, until(1.0, at_most=5), until(0.13, at_most=6), until(1e-9, at_most=3))
+"""Results scatter by 0.1: three of them are enough for the first, three or four for the next, none for the last."""
 
 
 class Answer(Enum):
@@ -320,6 +320,17 @@ class Queue(RuleBasedStateMachine):
     def a_late_result(self, lease: Lease) -> None:
         """Nothing but a lease that nobody has ended yet, though its dispatcher has crashed, takes it."""
         self.results_come([lease], Answer.COMES)
+
+    @rule(target=grids, rule=st.sampled_from(RULES[2:]), answer=ANSWERS)
+    def replicates_are_run(self, rule: Until, answer: Answer) -> Any:
+        """A grid comes, and results of all but the last lease of its kind: step by step that would be seldom."""
+        made = self.submit(1, rule, None, False, Answer.COMES)
+        self.claim(6, None, False, Answer.COMES)
+        self.results_come(self.of_points()[:-1], answer)
+        return made
+
+    def of_points(self) -> list[Lease]:
+        return [lease for lease in self.seen if self.valid(lease) and self.runs[lease.run_id].grid.rule is not None]
 
     def results_come(self, leases: list[Lease], answer: Answer) -> None:
         first, stored = [], []
