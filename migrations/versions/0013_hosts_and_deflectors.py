@@ -1,7 +1,7 @@
 """Hosts that are no Sersic profiles, and deflectors of more than one profile and one power law.
 
 Revision ID: 0013
-Revises: 0011
+Revises: 0012
 """
 
 import sqlalchemy as sa
@@ -9,7 +9,7 @@ from alembic import op
 from alembic.util.exc import CommandError
 
 revision = "0013"
-down_revision = "0011"
+down_revision = "0012"
 branch_labels = None
 depends_on = None
 

@@ -148,6 +148,7 @@ def test_exports_and_figures_tell_what_there_is(api: TestClient, settings: Setti
         ({"hosts": [{}]}, "/hosts/0/n"),
         ({"hosts": [{"n": 3}, {"n": 4}]}, "/hosts"),
         ({"n": None, "hosts": None}, "/n"),
+        ({"replicates": None, "until": {"quantity": "n", "error": 0.1}}, "/hosts"),
         ({"deflectors": [{"multipoles": [{"m": 2, "amplitude": 0.1}]}]}, "/deflectors/0/multipoles/0/m"),
         ({"deflectors": [{}, {"satellites": [{"theta_E": 0.1, "position": [1.5, 0.6]}]}]}, "/deflectors/1"),
     ],
