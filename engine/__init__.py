@@ -23,6 +23,7 @@ from engine.errors import (
     ObservationError,
     PosteriorError,
     SpecError,
+    StudyError,
 )
 from engine.grid import (
     Expansion,
@@ -111,6 +112,7 @@ if TYPE_CHECKING:
     from engine.simulation.scene import check_analysis, check_system
     from engine.simulation.seeds import generator
     from engine.simulation.simulate import Simulation, simulate_realization
+    from engine.study import STUDY_FORMAT, STUDY_METADATA_KEY, Study, read_study
 else:
     _LATE = {
         "engine.acceptance": "check_realization",
@@ -136,6 +138,7 @@ else:
         "engine.simulation.scene": "check_analysis check_system",
         "engine.simulation.seeds": "generator",
         "engine.simulation.simulate": "Simulation simulate_realization",
+        "engine.study": "STUDY_METADATA_KEY STUDY_FORMAT Study read_study",
     }
     _HOME = {name: module for module, names in _LATE.items() for name in names.split()}
 
@@ -159,6 +162,8 @@ __all__ = [
     "PRINTABLE",
     "PROFILES",
     "STAGES",
+    "STUDY_FORMAT",
+    "STUDY_METADATA_KEY",
     "TRENDS",
     "AccuracyError",
     "AccuracyReport",
@@ -213,6 +218,8 @@ __all__ = [
     "SpecError",
     "Spread",
     "StageTime",
+    "Study",
+    "StudyError",
     "SystemChoice",
     "Systems",
     "Trend",
@@ -256,6 +263,7 @@ __all__ = [
     "read_json",
     "read_mapping",
     "read_observation",
+    "read_study",
     "read_system",
     "readings",
     "realization_from_dict",
