@@ -13,14 +13,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
+from pyarrow import parquet
 
-from engine import Analysis, EngineError, Host, Realization, load_camera, load_system, run
-from engine.conventions import sky_to_image, sky_to_image_shear
+from engine import Analysis, EngineError, Host, Realization, load_system, run, traits_of
+from engine.conventions import sky_to_image
 from engine.digest import engine_digest
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.simulation.scene import power_law_lens
@@ -128,13 +130,38 @@ def _two(host: Any, name: str) -> tuple[float, float]:
     return value.bias, value.sd
 
 
+def write_table(records: list[dict[str, Any]], path: Path) -> None:
+    """A row for each run that found something: the lens's traits, biases and stated deviations."""
+    rows = []
+    for record in sorted(records, key=lambda one: (one["lens"], one["seed"])):
+        if "error" in record:
+            continue
+        traits = traits_of(drawn_realization(record["set"], record["lens"], record["seed"]), record["arc_magnitude"])
+        row: dict[str, Any] = {"run_id": f"{record['set']}-{record['lens']}#{record['seed']}"}
+        row["lens"] = f"{record['set']}-{record['lens']}"
+        row |= {f"traits_{name}": value for name, value in asdict(traits).items()}
+        for name in QUANTITIES:
+            row[f"{name}_bias"], row[f"{name}_sd"] = record[name]
+        rows.append(row)
+    table = pyarrow.Table.from_pylist(rows)
+    small = [field.with_type(pyarrow.float32()) if field.type == pyarrow.float64() else field for field in table.schema]
+    provenance = {"command": "python -m benchmarks.strangers", "engines": sorted({one["engine"] for one in records})}
+    schema = pyarrow.schema(small, metadata={"hostlens": json.dumps(provenance)})
+    parquet.write_table(table.cast(schema), path, compression="zstd", compression_level=19, write_statistics=False)
+    print(f"{path}: {len(rows)} runs of {len({row['lens'] for row in rows})} lenses, {path.stat().st_size} bytes")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--set", choices=sorted(SETS), default="strangers")
     parser.add_argument("--lenses", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--results", type=Path, default=ROOT / "var" / "strangers.jsonl")
+    parser.add_argument("--table", type=Path, help="Write what is done as Parquet, and simulate nothing")
     given = parser.parse_args()
+    if given.table is not None:
+        write_table([json.loads(line) for line in given.results.read_text().splitlines()], given.table)
+        return
     given.results.parent.mkdir(parents=True, exist_ok=True)
     done = set()
     if given.results.exists():

@@ -108,6 +108,17 @@ if TYPE_CHECKING:
     from engine.imaging.readings import Reading, readings
     from engine.inspection import InversionView, inspect_inversion
     from engine.measure import ImageMeasurement, measure_image
+    from engine.prediction.from_image import traits_of_image
+    from engine.prediction.predictor import (
+        NEAR,
+        PREDICTED,
+        EstimatorPrediction,
+        Predictor,
+        QuantityPrediction,
+        Range,
+        SimulatedRun,
+    )
+    from engine.prediction.traits import LensTraits, resolution_of, traits_of
     from engine.reconstruction import Reconstruction, analyse
     from engine.simulation.scene import check_analysis, check_system
     from engine.simulation.seeds import generator
@@ -134,6 +145,11 @@ else:
         "engine.imaging.readings": "Reading readings",
         "engine.inspection": "InversionView inspect_inversion",
         "engine.measure": "ImageMeasurement measure_image",
+        "engine.prediction.from_image": "traits_of_image",
+        "engine.prediction.predictor": (
+            "NEAR PREDICTED EstimatorPrediction Predictor QuantityPrediction Range SimulatedRun"
+        ),
+        "engine.prediction.traits": "LensTraits resolution_of traits_of",
         "engine.reconstruction": "Reconstruction analyse",
         "engine.simulation.scene": "check_analysis check_system",
         "engine.simulation.seeds": "generator",
@@ -159,6 +175,8 @@ __all__ = [
     "BIN_WIDTH",
     "GROUPINGS",
     "HOST_QUANTITIES",
+    "NEAR",
+    "PREDICTED",
     "PRINTABLE",
     "PROFILES",
     "STAGES",
@@ -177,6 +195,7 @@ __all__ = [
     "CoverageCurve",
     "EngineError",
     "Estimate",
+    "EstimatorPrediction",
     "Expansion",
     "FigureError",
     "FirstSeed",
@@ -194,6 +213,7 @@ __all__ = [
     "LensEquationError",
     "LensParameter",
     "LensSystem",
+    "LensTraits",
     "Magnitudes",
     "NoiseFromImage",
     "NoiseLevel",
@@ -203,15 +223,19 @@ __all__ = [
     "Optics",
     "ParameterPrior",
     "PosteriorError",
+    "Predictor",
     "Products",
     "PullSummary",
     "Quantity",
+    "QuantityPrediction",
     "Radii",
+    "Range",
     "Reading",
     "Realization",
     "Reconstruction",
     "Replicates",
     "RunResult",
+    "SimulatedRun",
     "Simulation",
     "Slopes",
     "SourcePlane",
@@ -268,6 +292,7 @@ __all__ = [
     "readings",
     "realization_from_dict",
     "report_from_dict",
+    "resolution_of",
     "run",
     "serial_numbers",
     "simulate_realization",
@@ -276,6 +301,8 @@ __all__ = [
     "system_facts",
     "system_from_mapping",
     "system_names",
+    "traits_of",
+    "traits_of_image",
     "trend_series",
     "write_observation",
 ]

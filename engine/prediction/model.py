@@ -188,7 +188,9 @@ def _bias(phi: FloatArray, y: FloatArray, expected: FloatArray, lens: IntArray, 
         return ridge, float(effect), float(noise)
 
     start = np.log([0.3 * size, 0.3 * (size / typical if relative else size), 1.2])
-    best = _most_evident(lambda parameters: fit(parameters)[0].ln_evidence, start)
+    # Amplitude and effect are kept off zero, where few lenses put them too often, by a prior that grows with them
+    # (Chung et al. 2013): at zero the interval of the mean would be nothing.
+    best = _most_evident(lambda parameters: fit(parameters)[0].ln_evidence + parameters[0] + parameters[1], start)
     ridge, effect, noise = fit(best)
     return _Regression(ridge, relative, effect, noise)
 

@@ -26,13 +26,14 @@ class SimulatedRun:
     """A run that predictions learn from: which lens it is of, and by estimator and quantity (bias, stated sd).
 
     Quantities are ``magnitude`` [mag], ``r_eff`` [arcsec] and ``n``. Runs of one lens share what is particular to it,
-    whatever their host, slope, depth and seed.
+    whatever their host, slope, depth and seed. ``cpu_s`` is what the run took.
     """
 
     run_id: str
     lens: str
     traits: LensTraits
     found: Mapping[str, Mapping[str, tuple[float, float]]]
+    cpu_s: float | None = None
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
+from engine.biases import Configuration, configuration_of
 from engine.catalogue import resolve_camera, resolve_dither, resolve_system
 from engine.conventions import FloatArray, rate_to_magnitude
 from engine.errors import SpecError
@@ -17,8 +18,6 @@ from engine.simulation.scene import build_scene
 from engine.spec.instrument import NOMINAL_OPTICS, Camera, Dither, ExposurePlan, NoiseLevel
 from engine.spec.realization import Realization
 
-Configuration = Literal["quad", "double", "other"]
-_CONFIGURATIONS: dict[int, Configuration] = {2: "double", 4: "quad"}
 _ARCSEC = math.pi / 648_000.0
 FAINT_AGN = 5.0
 """AGN contrast [mag] of a lens without AGN, or with one that is fainter still: it does no harm any more."""
@@ -30,7 +29,8 @@ class LensTraits:
 
     ``resolution`` [arcsec] is that of :func:`resolution_of`; ``depth`` [AB mag] the flux of one sigma of empty sky in
     a square arcsec; ``arc_magnitude`` that of the lensed host, ``magnitude`` that of the host behind the lens;
-    ``agn_contrast`` AGN minus arc, None without AGN; ``r_eff`` [arcsec], ``n`` and ``l_eta`` of host and deflector;
+    ``agn_contrast`` AGN minus arc, None without AGN; ``theta_E`` and ``r_eff`` [arcsec], ``n`` and ``l_eta`` of
+    deflector and host;
     ``defocus_nm`` and ``jitter`` [arcsec] by how much the telescope departs from the PSF of the analysis.
     """
 
@@ -41,6 +41,7 @@ class LensTraits:
     arc_magnitude: float
     magnitude: float
     agn_contrast: float | None
+    theta_E: float
     r_eff: float
     n: float
     l_eta: float
@@ -53,8 +54,8 @@ class LensTraits:
             raise SpecError("configuration", self.configuration, f"one of {list(get_args(Configuration))}")
         for name, least, most in (
             ("resolution", 1e-3, 10.0), ("depth", 5.0, 60.0), ("arc_magnitude", 5.0, 40.0), ("magnitude", 5.0, 40.0),
-            ("r_eff", 1e-4, 60.0), ("n", 0.3, 10.0), ("l_eta", 0.2, 1.8), ("agn_contrast", -40.0, 40.0),
-            ("defocus_nm", -500.0, 500.0), ("jitter", 0.0, 0.5),
+            ("theta_E", 1e-3, 30.0), ("r_eff", 1e-4, 60.0), ("n", 0.3, 10.0), ("l_eta", 0.2, 1.8),
+            ("agn_contrast", -40.0, 40.0), ("defocus_nm", -500.0, 500.0), ("jitter", 0.0, 0.5),
         ):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not least <= value <= most:
@@ -108,10 +109,11 @@ def traits_of(realization: Realization, arc_magnitude: float | None = None) -> L
         camera=camera.name,
         resolution=resolution_of(camera),
         depth=depth_of(camera, system.exposures, resolve_dither(system), realization.noise_level),
-        configuration=_CONFIGURATIONS.get(len(system.agn), "other"),
+        configuration=configuration_of(len(system.agn)),
         arc_magnitude=arc,
         magnitude=host.magnitude,
         agn_contrast=-2.5 * math.log10(light) - arc if light > 0 else None,
+        theta_E=system.mass_model(realization.mass_model, realization.l_eta).theta_E,
         r_eff=host.r_eff,
         n=host.n,
         l_eta=realization.l_eta,
@@ -131,7 +133,7 @@ def lensed_magnitude(realization: Realization) -> float:
 
 
 def features(traits: LensTraits) -> FloatArray:
-    """What the model sees, (7,), each in units in which a difference of one is a large one (:data:`FEATURES`)."""
+    """What the model sees, (9,), each in units in which a difference of one is a large one (:data:`FEATURES`)."""
     contrast = FAINT_AGN if traits.agn_contrast is None else min(traits.agn_contrast, FAINT_AGN)
     spoilt = math.hypot(traits.defocus_nm / 20.0, traits.jitter / 0.01)
     return np.array(
@@ -139,6 +141,8 @@ def features(traits: LensTraits) -> FloatArray:
             {"double": 0.0, "quad": 1.0, "other": 0.5}[traits.configuration],
             2.0 * math.log10(traits.arc_snr),
             4.0 * math.log10(traits.r_eff / traits.resolution),
+            4.0 * math.log10(traits.theta_E / traits.r_eff),
+            0.8 * (traits.magnitude - traits.arc_magnitude),
             traits.n / 1.5,
             traits.l_eta / 0.3,
             contrast / 1.5,
@@ -147,6 +151,7 @@ def features(traits: LensTraits) -> FloatArray:
     )
 
 
-FEATURES = ("configuration", "arc_snr", "r_eff", "n", "l_eta", "agn_contrast", "psf")
-"""Of which one unit is: two images or four; S/N by a factor 3.2; r_eff over resolution by 1.8; 1.5 in n; 0.3 in l_eta;
-1.5 mag of contrast; 20 nm of defocus or 0.01 arcsec of jitter that the analysis does not know."""
+FEATURES = ("configuration", "arc_snr", "r_eff", "theta_E", "magnification", "n", "l_eta", "agn_contrast", "psf")
+"""Of which one unit is: two images or four; S/N by a factor 3.2; r_eff over resolution, and theta_E over r_eff, by 1.8;
+magnification by 3.2; 1.5 in n; 0.3 in l_eta; 1.5 mag of contrast; 20 nm of defocus or 0.01 arcsec of jitter that the
+analysis does not know."""

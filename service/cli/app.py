@@ -19,6 +19,7 @@ from service.cli.connection import settings as _settings
 from service.cli.figures import figures
 from service.cli.frontier import frontier
 from service.cli.measuring import measure
+from service.cli.predict import predict
 from service.cli.replay import replay
 from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
@@ -67,7 +68,7 @@ app = typer.Typer(
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, accuracy, measure, replay):
+for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, predict, figures, accuracy, measure, replay):
     app.command()(command)
 
 
