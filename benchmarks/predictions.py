@@ -1,11 +1,12 @@
 """Are predictions of bias and scatter right for lenses that nobody has simulated? And how fast are they?
 
-    python -m benchmarks.predictions [--strangers FILE]
+    python -m benchmarks.predictions
 
 Two questions, both of 90 % intervals for what one image shows. Leaving out one *system* of the study at a time, with
-all its runs: how many of them does the interval hold that is made of the other systems (and, for ``image``, of the drawn
-lenses)? And of 200 strangers, lenses of benchmarks.strangers from another seed: how many, and how wide is the interval
-against an oracle's, who knows the scatter at that very lens?
+all its runs: how many of them does the interval hold that is made of the other systems (and, for ``image``, of the
+drawn lenses)? And of strangers, the drawn lenses that come with hostlens (benchmarks.strangers), each predicted by the
+study and by the nine tenths of them that it is not in: how many, and how wide is the interval against an oracle's, who
+knows the scatter at that very lens?
 
 The oracle of a stranger takes the deviation that ``image`` states there, times the one factor that makes these cover
 90 % of all strangers; that of a left-out system the 5 and 95 % quantiles of its own runs' biases.
@@ -13,20 +14,18 @@ The oracle of a stranger takes the deviation that ``image`` states there, times 
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from engine import PREDICTED, Predictor, SimulatedRun
-from service.predictions.shipped import read_drawn, shipped_runs
+from service.predictions.shipped import shipped_runs
 
-STRANGERS = Path(__file__).resolve().parent / "strangers.parquet"
 ESTIMATORS = ("image_wide", "projected_wide", "covariance_wide", "paper_wide")
 LEVEL = 0.9
+FOLDS = 10
 
 
 def judged(predictor: Predictor, runs: Iterable[SimulatedRun], estimator: str) -> dict[str, np.ndarray]:
@@ -85,13 +84,21 @@ def tell_left_out(runs: tuple[SimulatedRun, ...]) -> None:
             )
 
 
-def tell_strangers(runs: tuple[SimulatedRun, ...], strangers: list[SimulatedRun], what: str) -> None:
-    predictor = Predictor([run for run in runs if "image_wide" in run.found])
-    if "image_wide" not in predictor.estimators():
-        return
-    far = sum(predictor.predict(run.traits, "image_wide", LEVEL).extrapolating for run in strangers)
-    print(f"{what}: {len(strangers)} images of {len({run.lens for run in strangers})} strangers, {far} extrapolate")
-    for name, rows in judged(predictor, strangers, "image_wide").items():
+def tell_strangers(study: tuple[SimulatedRun, ...], strangers: list[SimulatedRun]) -> None:
+    """Each stranger by the study and by the folds that it is not in; which fold is a matter of a fixed seed."""
+    lenses = sorted({run.lens for run in strangers})
+    fold = dict(zip(lenses, np.random.default_rng(20176).permutation(len(lenses)) % FOLDS, strict=True))
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in PREDICTED}
+    far = 0
+    for number in range(FOLDS):
+        mine = [run for run in strangers if fold[run.lens] == number]
+        predictor = Predictor([*study, *(run for run in strangers if fold[run.lens] != number)])
+        far += sum(predictor.predict(run.traits, "image_wide", LEVEL).extrapolating for run in mine)
+        for name, rows in judged(predictor, mine, "image_wide").items():
+            parts[name].append(rows)
+    print(f"{len(strangers)} images of {len(lenses)} strangers, of which {far} extrapolate:")
+    for name, several in parts.items():
+        rows = np.concatenate(several)
         factor = np.quantile(np.abs(rows[:, 0]) / rows[:, 1], LEVEL)
         own, ours = 2.0 * factor * rows[:, 1], rows[:, 3] - rows[:, 2]
         print(
@@ -117,14 +124,11 @@ def tell_time(runs: tuple[SimulatedRun, ...], strangers: list[SimulatedRun]) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--strangers", type=Path, default=STRANGERS)
-    given = parser.parse_args()
-    runs, strangers = shipped_runs(), list(read_drawn(given.strangers))
+    runs = shipped_runs()
     study = tuple(run for run in runs if "paper_wide" in run.found)
-    print(f"{len(study)} runs of the study, {len(runs) - len(study)} of drawn lenses")
-    tell_strangers(runs, strangers, "study and drawn lenses")
-    tell_strangers(study, strangers, "study alone")
+    strangers = [run for run in runs if "paper_wide" not in run.found]
+    print(f"{len(study)} runs of {len({run.lens for run in study})} systems of the study")
+    tell_strangers(study, strangers)
     tell_left_out(runs)
     tell_time(runs, strangers)
 

@@ -1,11 +1,12 @@
-"""Lenses that nobody has simulated, drawn at random, and what ``image`` finds in them: for benchmarks.predictions.
+"""Lenses that nobody has simulated, drawn at random, and what ``image`` finds in them: what predictions learn from.
 
-    python -m benchmarks.strangers [--set strangers] [--lenses 200] [--seeds 4] [--results FILE]
+    python -m benchmarks.strangers [--lenses 200] [--results FILE]      simulate
+    python -m benchmarks.strangers --table service/predictions/drawn.parquet
 
-Two sets of equal distribution and other seeds: ``strangers`` are held back, to be predicted; ``drawn`` are simulated
-so that predictions have runs to learn from beside the study's eight systems. A lens has a camera of the catalogue with
-a dither pattern that the study has for it and 1, 2 or 4 long exposures; its mass, source position and host are drawn,
-with an AGN of two images or four. ``image`` alone takes 1-4 CPU s. What is done is not done again.
+They stand beside the study's eight systems, and are what benchmarks.predictions is scored on, each by the others. A
+lens has a camera of the catalogue with a dither pattern that the study has for it and 1, 2 or 4 long exposures; its
+mass, source position and host are drawn, with an AGN of two images or four. ``image`` alone takes 2-4 CPU s. What is
+done is not done again; two sets, of other seeds and the same distribution, can be simulated side by side.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ def _two(host: Any, name: str) -> tuple[float, float]:
 def write_table(records: list[dict[str, Any]], path: Path) -> None:
     """A row for each run that found something: the lens's traits, biases and stated deviations."""
     rows = []
-    for record in sorted(records, key=lambda one: (one["lens"], one["seed"])):
+    for record in sorted(records, key=lambda one: (one["set"], one["lens"], one["seed"])):
         if "error" in record:
             continue
         traits = traits_of(drawn_realization(record["set"], record["lens"], record["seed"]), record["arc_magnitude"])
@@ -154,6 +155,7 @@ def write_table(records: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--set", choices=sorted(SETS), default="strangers")
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--lenses", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--results", type=Path, default=ROOT / "var" / "strangers.jsonl")
@@ -170,7 +172,7 @@ def main() -> None:
             done.add((record["set"], record["lens"], record["seed"]))
     with given.results.open("a") as log:
         for seed in range(given.seeds):
-            for number in range(given.lenses):
+            for number in range(given.first, given.first + given.lenses):
                 if (given.set, number, seed) not in done:
                     log.write(json.dumps(measured(given.set, number, seed)) + "\n")
                     log.flush()

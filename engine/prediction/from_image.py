@@ -17,6 +17,9 @@ from engine.spec.instrument import Camera
 
 _STAMP_WIDTH = 2.0 * math.sqrt(math.log(2.0) / (2.0 * math.pi))
 """FWHM of a Gaussian over the root of 1 / sum p^2, the area that its light fills."""
+_WINGS = 1.55
+"""That width of the catalogue's cameras over their :func:`~engine.prediction.traits.resolution_of`: 1.51 to 1.65, by
+wings, pixels and drizzling."""
 
 
 def traits_of_image(found: ImageMeasurement) -> LensTraits:
@@ -54,11 +57,11 @@ def _camera(observation: Observation) -> Camera | None:
 def _stamp_resolution(observation: Observation) -> float:
     """Width of the PSF's stamp [arcsec]: that of a Gaussian whose light fills as many pixels."""
     share = observation.psf / observation.psf.sum()
-    return observation.pixel_scale * _STAMP_WIDTH / math.sqrt(float(np.sum(share**2)))
+    return observation.pixel_scale * _STAMP_WIDTH / _WINGS / math.sqrt(float(np.sum(share**2)))
 
 
 def _depth(found: ImageMeasurement) -> float:
-    """AB magnitude of one sigma of empty sky in a square arcsec: of the tenth of the pixels with the least noise."""
+    """AB magnitude of one sigma of empty sky in a square arcsec: where the noise is least."""
     observation = found.observation
     valid = observation.valid.ravel()
     if observation.covariance is None:
@@ -72,5 +75,5 @@ def _depth(found: ImageMeasurement) -> float:
     quiet = variance[valid & (variance > 0)]
     if quiet.size < 100:
         raise ObservationError(f"depth: got {quiet.size} pixels with a variance, allowed are 100 at least")
-    pixel = math.sqrt(float(np.quantile(quiet, 0.1)))
+    pixel = math.sqrt(float(np.quantile(quiet, 0.05)))
     return rate_to_magnitude(pixel / observation.pixel_scale, observation.zero_point)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,11 @@ class GroupedRidge:
     of_group: FloatArray
     weighted_of_group: FloatArray
     ln_evidence: float
+
+    @cached_property
+    def posterior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (p,) and covariance (p, p) of the coefficients by all groups."""
+        return self.coefficients()
 
     def coefficients(self, without: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Mean (p,) and covariance (p, p) of the coefficients, by all groups or by all but one."""

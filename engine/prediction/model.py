@@ -7,14 +7,16 @@ regression, effect and scatter are those of the highest evidence.
 
 Intervals are conformal over lenses: each lens is predicted by the others (CV+ with whole lenses left out; Barber et al.
 2021), each has the same weight however many runs it has, and a lens that is not there counts as one with an infinite
-score (Dunn, Wasserman & Ramdas 2023). Below so many lenses that this is finite, Student's t of the lens effects
-holds instead, where it is wider than the scores.
+score (Dunn, Wasserman & Ramdas 2023). With so few lenses that this would be infinite (fewer than 9 at 90 %) no interval
+is free of assumptions: it is then Student's t of the lens effects and the normal scatter, or what the lenses left out
+take where that is wider.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 from scipy.optimize import minimize
@@ -23,9 +25,12 @@ from scipy.stats import t as student
 from engine.conventions import FloatArray
 from engine.prediction.mixed import GroupedRidge, IntArray, fit_grouped
 
+_NORMAL = NormalDist()
 LEAST_LENSES = 4
 """Lenses below which nothing is fitted: what differs from lens to lens cannot be told from what they have in common."""
 _LEAST_SD = 1e-5
+_CONSTANT = 3.0
+"""Prior deviation of the constant of y [mag, or in logarithms]: as good as none."""
 _CURVED = 0.4
 """Prior deviation of a coefficient of squares and products, in that of the linear ones."""
 
@@ -59,7 +64,7 @@ class _Regression:
 
     def predict(self, phi: FloatArray, without: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Mean and deviation of the regression at phi (points, p); the lens's own effect is not in it."""
-        mean, covariance = self.ridge.coefficients(without)
+        mean, covariance = self.ridge.posterior if without is None else self.ridge.coefficients(without)
         return phi @ mean, np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", phi, covariance, phi), 0.0))
 
 
@@ -90,7 +95,8 @@ class BiasModel:
         expected = np.exp(self._ln_s.predict(phi)[0])
         found = [_bias(phi, y, expected, lens, relative) for relative in (False, True)]
         self._y = max(found, key=lambda one: one.ridge.ln_evidence)
-        self._scores, self._weights = self._left_out(phi, y, lens)
+        self._left = self._left_out(phi, y, lens)
+        self._stretches: dict[float, float] = {}
 
     def _basis(self, x: FloatArray) -> FloatArray:
         z = (x - self._centre)[:, self._used] / self._spread
@@ -105,27 +111,36 @@ class BiasModel:
         effect = self._y.effect * (expected if self._y.relative else 1.0)
         return mean, np.hypot(sd, effect), self._y.noise * expected
 
-    def _left_out(self, phi: FloatArray, y: FloatArray, lens: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Scores of the runs, each by the other lenses, from the smallest on, and their weights."""
-        scores, weights = np.empty(len(y)), np.empty(len(y))
+    def _left_out(self, phi: FloatArray, y: FloatArray, lens: IntArray) -> FloatArray:
+        """Of each run by the other lenses: distance from the mean, deviations of lens and run, weight; (4, runs)."""
+        out = np.empty((4, len(y)))
         for place in range(self.lenses):
             mine = lens == place
             mean, sd, scatter = self._predict(phi[mine], place)
-            scores[mine] = np.abs(y[mine] - mean) / np.hypot(sd, scatter)
-            weights[mine] = 1.0 / (mine.sum() * (self.lenses + 1.0))
-        order = np.argsort(scores)
-        return scores[order], weights[order]
+            out[:, mine] = np.abs(y[mine] - mean), sd, scatter, np.full(mine.sum(), 1.0 / mine.sum())
+        return out
 
-    def reach(self, level: float) -> float:
-        """Half-width of an interval in units of the deviation that the regression expects."""
-        held = np.cumsum(self._weights)
-        enough = int(np.searchsorted(held, level))
+    def _half(self, sd: FloatArray, scatter: FloatArray, level: float) -> FloatArray:
+        """Half-width of an interval by the regression: Student's t of the lens and the normal scatter of one run."""
+        tail = student.ppf(0.5 + 0.5 * level, self.lenses - 2)
+        return np.asarray(np.hypot(tail * sd, _NORMAL.inv_cdf(0.5 + 0.5 * level) * scatter))
+
+    def _stretch(self, level: float) -> float:
+        """What the half-width is to be multiplied with, so that the intervals hold the lenses that were left out."""
+        if level not in self._stretches:
+            self._stretches[level] = self._stretched(level)
+        return self._stretches[level]
+
+    def _stretched(self, level: float) -> float:
+        distance, sd, scatter, weight = self._left
+        scores = distance / self._half(sd, scatter, level)
+        order = np.argsort(scores)
+        held = np.cumsum(weight[order])
+        enough = int(np.searchsorted(held, level * (self.lenses + 1.0)))
         if enough < len(held):
-            return float(self._scores[enough])
-        tail = float(student.ppf(0.5 + 0.5 * level, self.lenses - 2))
-        # Of the lenses that there are, each with the same weight.
-        mine = int(np.searchsorted(held / held[-1], level))
-        return max(tail, float(self._scores[min(mine, len(held) - 1)]))
+            return float(scores[order][enough])
+        mine = min(int(np.searchsorted(held, level * self.lenses)), len(held) - 1)
+        return max(1.0, float(scores[order][mine]))
 
     def expect(self, x: FloatArray, level: float) -> Expected:
         """What is expected at features x (features,), with intervals of probability ``level``."""
@@ -134,7 +149,7 @@ class BiasModel:
         mean, sd, scatter = float(means[0]), float(sds[0]), float(scatters[0])
         tail = float(student.ppf(0.5 + 0.5 * level, self.lenses - 2))
         spread = math.exp(tail * math.hypot(float(self._ln_s.predict(phi)[1][0]), self._ln_s.effect))
-        reach = self.reach(level) * math.hypot(sd, scatter)
+        reach = self._stretch(level) * float(self._half(sds, scatters, level)[0])
         return Expected(
             mean=mean,
             mean_low=mean - tail * sd,
@@ -148,9 +163,10 @@ class BiasModel:
 
 
 def _amplitudes(phi: FloatArray, features: int, size: float) -> FloatArray:
-    """Prior deviations: the constant and linear terms ``size``, squares and products less."""
+    """Prior deviations: linear terms ``size``, squares and products less, the constant whatever it may be."""
     out = np.full(phi.shape[1], size * _CURVED)
-    out[: features + 1] = size
+    out[1 : features + 1] = size
+    out[0] = _CONSTANT
     return out
 
 

@@ -166,15 +166,14 @@ def _relative(run: SimulatedRun, estimator: str, name: str) -> tuple[float, floa
 
 def _in_units(found: Expected, traits: LensTraits, name: str) -> QuantityPrediction:
     """Of a magnitude as it is, of a radius or an index in its own units."""
-    if name == "magnitude":
-        true, of = 1.0, lambda value: value
-        size = 1.0
-    else:
-        true = getattr(traits, name)
-        size = true * math.exp(found.mean)
-        of = lambda value: true * math.expm1(value)  # noqa: E731
+    true: float | None = None if name == "magnitude" else getattr(traits, name)
+    size = 1.0 if true is None else true * math.exp(found.mean)
+
+    def bias(*values: float) -> Range:
+        return Range(*(value if true is None else true * math.expm1(value) for value in values))
+
     return QuantityPrediction(
-        bias=Range(of(found.mean), of(found.mean_low), of(found.mean_high)),
+        bias=bias(found.mean, found.mean_low, found.mean_high),
         scatter=Range(*(size * value for value in (found.scatter, found.scatter_low, found.scatter_high))),
-        measurement=Range(of(found.mean), of(found.low), of(found.high)),
+        measurement=bias(found.mean, found.low, found.high),
     )

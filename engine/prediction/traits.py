@@ -10,7 +10,7 @@ import numpy as np
 
 from engine.biases import Configuration, configuration_of
 from engine.catalogue import resolve_camera, resolve_dither, resolve_system
-from engine.conventions import FloatArray, rate_to_magnitude
+from engine.conventions import FloatArray, pixel_centres, rate_to_magnitude
 from engine.errors import SpecError
 from engine.imaging.noise import exposure_noise
 from engine.light.rendering import render_sersic
@@ -70,7 +70,8 @@ class LensTraits:
         magnified = 10.0 ** (0.4 * (self.magnitude - self.arc_magnitude))
         images = 4 if self.configuration == "quad" else 2
         area = math.pi * (magnified * self.r_eff**2 + images * (0.5 * self.resolution) ** 2)
-        return 0.5 * 10.0 ** (-0.4 * (self.arc_magnitude - self.depth)) / math.sqrt(area)
+        signal: float = 0.5 * 10.0 ** (-0.4 * (self.arc_magnitude - self.depth))
+        return signal / math.sqrt(area)
 
     def deeper(self, factor: float) -> LensTraits:
         """The same lens after ``factor`` times the exposures: the sky's noise falls with their root."""
@@ -127,7 +128,7 @@ def lensed_magnitude(realization: Realization) -> float:
     scene = build_scene(realization)
     reach = 0.5 * scene.system.exposures.field_pixels * scene.camera.drizzled_scale
     cells = math.ceil(2.0 * reach / scene.camera.pixel_scale)
-    axis = (np.arange(cells) - 0.5 * (cells - 1)) * scene.camera.pixel_scale
+    axis = pixel_centres(cells, scene.camera.pixel_scale)
     light = render_sersic(scene.host, axis, axis, scene.camera.pixel_scale, scene.lens)
     return rate_to_magnitude(float(light.sum()), scene.camera.zero_point)
 
@@ -135,7 +136,7 @@ def lensed_magnitude(realization: Realization) -> float:
 def features(traits: LensTraits) -> FloatArray:
     """What the model sees, (9,), each in units in which a difference of one is a large one (:data:`FEATURES`)."""
     contrast = FAINT_AGN if traits.agn_contrast is None else min(traits.agn_contrast, FAINT_AGN)
-    spoilt = math.hypot(traits.defocus_nm / 20.0, traits.jitter / 0.01)
+    spoilt = math.hypot(traits.defocus_nm / 5.0, traits.jitter / 0.003)
     return np.array(
         [
             {"double": 0.0, "quad": 1.0, "other": 0.5}[traits.configuration],
@@ -153,5 +154,5 @@ def features(traits: LensTraits) -> FloatArray:
 
 FEATURES = ("configuration", "arc_snr", "r_eff", "theta_E", "magnification", "n", "l_eta", "agn_contrast", "psf")
 """Of which one unit is: two images or four; S/N by a factor 3.2; r_eff over resolution, and theta_E over r_eff, by 1.8;
-magnification by 3.2; 1.5 in n; 0.3 in l_eta; 1.5 mag of contrast; 20 nm of defocus or 0.01 arcsec of jitter that the
+magnification by 3.2; 1.5 in n; 0.3 in l_eta; 1.5 mag of contrast; 5 nm of defocus or 0.003 arcsec of jitter that the
 analysis does not know."""

@@ -60,13 +60,12 @@ def predict(
         "level": level, "exposures": None if depth is None else _factors(depth), "grids": grid or None,
         "camera": None if camera is None else named_or_read(camera, "--camera"),
     }  # fmt: skip
-    asked: dict[str, Any] = {name: value for name, value in optional.items() if value is not None} | {"study": study}
-    optics = {name: value for name, value in (("defocus_nm", defocus_nm), ("jitter", jitter)) if value is not None}
+    asked = _given(optional) | {"study": study}
+    optics = _given({"defocus_nm": defocus_nm, "jitter": jitter})
     if image is not None:
-        given = [name for name in ("l_eta", "mass_model", "noise_level", "camera") if name in asked]
-        given += [name for name, value in host.items() if value is not None]
-        if given:
-            raise typer.BadParameter(f"--{given[0].replace('_', '-')}: the --image says what the lens is")
+        for name in ("n", "r_eff", "magnitude", "l_eta", "mass_model", "noise_level", "camera"):
+            if (host | optional).get(name) is not None:
+                raise typer.BadParameter(f"--{name.replace('_', '-')}: the --image says what the lens is")
         asked["traits"] = _measured(image, psf) | optics
     else:
         asked |= _of_system(str(system), host, psf) | ({"optics": optics} if optics else {})
@@ -78,6 +77,10 @@ def predict(
     if grid_file is not None:
         grid_file.write_text(json.dumps(found.to_know[-1].request, indent=2) + "\n", encoding="utf-8")
         typer.echo(str(grid_file), err=style is Format.JSON)
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _factors(text: str) -> list[float]:

@@ -28,7 +28,7 @@ from engine import (
     resolution_of,
     traits_of,
 )
-from service.domain.payload import estimator_and_prior
+from service.domain.payload import ESTIMATES, estimator_and_prior
 from service.domain.prediction_views import (
     ExpectedView,
     GridOffer,
@@ -66,7 +66,7 @@ def answer(
     """
     traits = lens_traits(request)
     known = predictor.estimators()
-    names = request.estimators or [name for name in known if estimator_and_prior(name)[1] == "wide"]
+    names = request.estimators or [name for name in ESTIMATES if name in known and name.endswith("_wide")]
     if not names:
         raise SpecError("grids", request.grids, "grids with runs of four lenses at least, or study = true beside them")
     predictions = [_at_depth(traits.deeper(factor), factor, names, predictor, request) for factor in request.exposures]

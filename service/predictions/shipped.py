@@ -11,7 +11,7 @@ from typing import Any
 from engine import PREDICTED, Host, LensTraits, Predictor, Realization, SimulatedRun, read_study, traits_of
 
 DRAWN = "drawn.parquet"
-"""Made by ``python -m benchmarks.strangers --set drawn --table``."""
+"""Made by ``python -m benchmarks.strangers --table``."""
 _IMAGE = "image_wide"
 
 
@@ -68,8 +68,4 @@ def read_drawn(path: Path) -> Iterable[SimulatedRun]:
 
 
 def _found(row: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
-    return {
-        name: (row[f"{name}_bias"], row[f"{name}_sd"])
-        for name in PREDICTED
-        if row[f"{name}_bias"] is not None
-    }
+    return {name: (row[f"{name}_bias"], row[f"{name}_sd"]) for name in PREDICTED if row[f"{name}_bias"] is not None}
