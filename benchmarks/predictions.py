@@ -1,6 +1,6 @@
 """Are predictions of bias and scatter right for lenses that nobody has simulated? And how fast are they?
 
-    python -m benchmarks.predictions
+    python -m benchmarks.predictions [--study FILE]
 
 Two questions, both of 90 % intervals for what one image shows. Leaving out one *system* of the study at a time, with
 all its runs: how many of them does the interval hold that is made of the other systems (and, for ``image``, of the
@@ -14,14 +14,16 @@ The oracle of a stranger takes the deviation that ``image`` states there, times 
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from engine import PREDICTED, Predictor, SimulatedRun
-from service.predictions.shipped import shipped_runs
+from engine import PREDICTED, Predictor, SimulatedRun, read_study
+from service.predictions.shipped import shipped_runs, study_runs
 
 ESTIMATORS = ("image_wide", "projected_wide", "covariance_wide", "paper_wide")
 LEVEL = 0.9
@@ -124,9 +126,12 @@ def tell_time(runs: tuple[SimulatedRun, ...], strangers: list[SimulatedRun]) -> 
 
 
 def main() -> None:
-    runs = shipped_runs()
-    study = tuple(run for run in runs if "paper_wide" in run.found)
-    strangers = [run for run in runs if "paper_wide" not in run.found]
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--study", type=Path, help="Another study's file than the one that comes with hostlens")
+    given = parser.parse_args()
+    strangers = [run for run in shipped_runs() if "paper_wide" not in run.found]
+    study = tuple(study_runs(read_study(given.study)))
+    runs = (*study, *strangers)
     print(f"{len(study)} runs of {len({run.lens for run in study})} systems of the study")
     tell_strangers(study, strangers)
     tell_left_out(runs)

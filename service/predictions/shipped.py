@@ -8,7 +8,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
 
-from engine import PREDICTED, Host, LensTraits, Predictor, Realization, SimulatedRun, read_study, traits_of
+from engine import PREDICTED, Host, LensTraits, Predictor, Realization, SimulatedRun, Study, read_study, traits_of
 
 DRAWN = "drawn.parquet"
 """Made by ``python -m benchmarks.strangers --table``."""
@@ -18,7 +18,7 @@ _IMAGE = "image_wide"
 @cache
 def shipped_runs() -> tuple[SimulatedRun, ...]:
     """All of them, read once."""
-    return (*_study_runs(), *_drawn_runs())
+    return (*study_runs(read_study()), *_drawn_runs())
 
 
 @cache
@@ -27,9 +27,10 @@ def shipped_predictor() -> Predictor:
     return Predictor(shipped_runs())
 
 
-def _study_runs() -> Iterable[SimulatedRun]:
+def study_runs(study: Study) -> Iterable[SimulatedRun]:
+    """The runs of a study of the catalogue's systems, with the answers of all estimators."""
     rows: dict[str, list[Mapping[str, Any]]] = {}
-    for row in read_study().table.to_pylist():
+    for row in study.table.to_pylist():
         rows.setdefault(row["run_id"], []).append(row)
     for run_id, answers in rows.items():
         first = answers[0]
