@@ -91,21 +91,22 @@ def tell_strangers(study: tuple[SimulatedRun, ...], strangers: list[SimulatedRun
     lenses = sorted({run.lens for run in strangers})
     fold = dict(zip(lenses, np.random.default_rng(20176).permutation(len(lenses)) % FOLDS, strict=True))
     parts: dict[str, list[np.ndarray]] = {name: [] for name in PREDICTED}
-    far = 0
+    far: list[bool] = []
     for number in range(FOLDS):
         mine = [run for run in strangers if fold[run.lens] == number]
         predictor = Predictor([*study, *(run for run in strangers if fold[run.lens] != number)])
-        far += sum(predictor.predict(run.traits, "image_wide", LEVEL).extrapolating for run in mine)
+        far += [predictor.predict(run.traits, "image_wide", LEVEL).extrapolating for run in mine]
         for name, rows in judged(predictor, mine, "image_wide").items():
             parts[name].append(rows)
-    print(f"{len(strangers)} images of {len(lenses)} strangers, of which {far} extrapolate:")
+    print(f"{len(strangers)} images of {len(lenses)} strangers, of which {sum(far)} extrapolate:")
     for name, several in parts.items():
         rows = np.concatenate(several)
         factor = np.quantile(np.abs(rows[:, 0]) / rows[:, 1], LEVEL)
         own, ours = 2.0 * factor * rows[:, 1], rows[:, 3] - rows[:, 2]
         print(
             f"  {name:10s} {100 * inside(rows):5.1f} % inside, width {ours.mean() / own.mean():.2f} of the oracle's "
-            f"(median ratio {np.median(ours / own):.2f}; the oracle takes {factor:.2f} stated deviations)"
+            f"(median ratio {np.median(ours / own):.2f}; the oracle takes {factor:.2f} stated deviations); "
+            f"of those that extrapolate {100 * inside(rows[np.array(far)]):.0f} % inside"
         )
 
 

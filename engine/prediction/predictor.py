@@ -15,9 +15,9 @@ from engine.prediction.model import LEAST_LENSES, BiasModel, Expected
 from engine.prediction.traits import FEATURES, LensTraits, features
 
 PREDICTED = ("magnitude", "r_eff", "n")
-NEAR = 1.0
-"""Distance beyond which no run is near: one large difference (:data:`engine.prediction.traits.FEATURES`), or several
-that are as large together."""
+NEAR = 1.5
+"""Distance beyond which no run is near: one large difference (:data:`engine.prediction.traits.FEATURES`) and a half, or
+several that are as large together."""
 _SHOWN_RUNS = 10
 
 

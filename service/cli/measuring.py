@@ -115,12 +115,6 @@ def measure(
         raise typer.Exit(1)
 
 
-def read_image(image: Path, psf: Path | None) -> Observation:
-    """An image of ours, or one of anybody's with its PSF whose header says the rest."""
-    names = ("unit", "noise", "pixel_scale", "zero_point", "mask", "exposure_s")
-    return _observation(image, psf, trust_options=False, **dict.fromkeys(names))
-
-
 def _short(value: str | float) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 

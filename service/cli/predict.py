@@ -106,9 +106,10 @@ def _measured(image: Path, psf: Path | None) -> dict[str, Any]:
         from dataclasses import asdict  # noqa: PLC0415 - as the engine
 
         from engine import measure_image, traits_of_image  # noqa: PLC0415 - seconds, which only a request is worth
-        from service.cli.measuring import read_image  # noqa: PLC0415
+        from service.cli.measuring import observation_of_files  # noqa: PLC0415
 
-        return asdict(traits_of_image(measure_image(read_image(image, psf), inversion=False)))
+        observation = observation_of_files(image, psf, trust_options=False, unit=None)
+        return asdict(traits_of_image(measure_image(observation, inversion=False)))
 
 
 def _answer(asked: dict[str, Any], url: str | None, token: str | None) -> PredictionAnswer:

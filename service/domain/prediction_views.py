@@ -58,7 +58,7 @@ class PredictedEstimator(_Answer):
     run_ids: list[str]
     """The nearest ten, the nearest first."""
     extrapolating: bool
-    """No run is nearer than a distance of 1."""
+    """No run is nearer than a distance of 1.5."""
     nearest: NearestRun
 
 
