@@ -46,7 +46,7 @@ class Installation(runtime.Installation):
 
 
 def _put_database(folder: Path) -> None:
-    """A database with its tables, where there is none: to make them is the smaller half of a supervisor's start."""
+    """A database with its tables, where there is none: to make them takes a third of the supervisor's start."""
     file = folder / "hostlens.sqlite"
     if not file.exists():
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
