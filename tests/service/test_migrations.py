@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from service.cli.app import app
 from service.domain.views import Summary
 from service.store.database import Database
+from service.store.faults import MigrationError
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import (
-    MigrationError,
     current,
     differences,
     downgrade,
