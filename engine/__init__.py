@@ -26,10 +26,12 @@ from engine.errors import (
     StudyError,
 )
 from engine.grid import (
+    Deflectors,
     Expansion,
     FirstSeed,
     Grid,
     GridRun,
+    Hosts,
     Indices,
     Magnitudes,
     Radii,
@@ -52,6 +54,8 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import PROFILES, Analysis
+from engine.spec.deflector import USUAL_DEFLECTOR, Deflector
+from engine.spec.host import Host, HostImage, HostShape, MadeGalaxy
 from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.json_text import read_json
 from engine.spec.priors import ParameterPrior
@@ -63,7 +67,7 @@ from engine.spec.realization import (
     spec_digest,
     system_from_mapping,
 )
-from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.sky import LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 from engine.stages import ACCURACY_STAGES, STAGES
 from engine.user_files import read_camera, read_mapping, read_system
@@ -103,6 +107,7 @@ if TYPE_CHECKING:
     from engine.codes.coolest import write_coolest
     from engine.comparison import compare
     from engine.experiment import inspect_simulation, run
+    from engine.host_files import read_host_image
     from engine.imaging.external import observation_from_arrays
     from engine.imaging.external_files import read_external_observation
     from engine.imaging.fits import read_observation, write_observation
@@ -143,6 +148,7 @@ else:
         "engine.codes.coolest": "write_coolest",
         "engine.comparison": "compare",
         "engine.experiment": "inspect_simulation run",
+        "engine.host_files": "read_host_image",
         "engine.imaging.external": "observation_from_arrays",
         "engine.imaging.external_files": "read_external_observation",
         "engine.imaging.fits": "read_observation write_observation",
@@ -189,6 +195,7 @@ __all__ = [
     "STUDY_FORMAT",
     "STUDY_METADATA_KEY",
     "TRENDS",
+    "USUAL_DEFLECTOR",
     "AccuracyError",
     "AccuracyReport",
     "Analysis",
@@ -201,6 +208,8 @@ __all__ = [
     "Comparison",
     "Configuration",
     "CoverageCurve",
+    "Deflector",
+    "Deflectors",
     "EngineError",
     "Estimate",
     "EstimatorPrediction",
@@ -211,7 +220,10 @@ __all__ = [
     "GridRun",
     "Grouping",
     "Host",
+    "HostImage",
     "HostQuantity",
+    "HostShape",
+    "Hosts",
     "Identifier",
     "ImageMeasurement",
     "ImagePlane",
@@ -222,6 +234,7 @@ __all__ = [
     "LensParameter",
     "LensSystem",
     "LensTraits",
+    "MadeGalaxy",
     "Magnitudes",
     "NoiseFromImage",
     "NoiseLevel",
@@ -294,6 +307,7 @@ __all__ = [
     "pull_summary",
     "read_camera",
     "read_external_observation",
+    "read_host_image",
     "read_json",
     "read_mapping",
     "read_observation",

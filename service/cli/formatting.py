@@ -18,6 +18,7 @@ from service.domain.views import (
     SummaryValue,
 )
 
+_USUAL = ("sersic", "plain")
 _INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
 ROWS: tuple[tuple[EstimateName, str, str], ...] = (
     ("image_wide", "magnitude", "magnitude"),
@@ -54,7 +55,8 @@ def summary_table(summary: Summary) -> Table:
         table.add_column(title, justify="right", no_wrap=True)
     for row in summary.rows:
         named = [f"{row.input['system']} ({row.n_runs} run{'s' * (row.n_runs > 1)})"]
-        named += [f"{title} = {row.input[name]:g}" for name, title in _INPUT]
+        named += [f"{title} = {row.input[name]:g}" for name, title in _INPUT if row.input[name] is not None]
+        named += [f"{name} {row.input[name]}" for name in ("host_label", "deflector") if row.input[name] not in _USUAL]
         named += [""] * (len(ROWS) - len(named))
         for place, (cell, (estimate, quantity, title)) in enumerate(zip(named, ROWS, strict=True)):
             last = place == len(ROWS) - 1

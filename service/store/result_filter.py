@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, Select, and_, case, or_, select
 
-from service.store.tables import input_group, run
+from service.store.tables import USUAL_INPUTS, input_group, run
 
 NONE = "none"
 """How a value that is not there is written, in a filter and in an answer's link."""
@@ -37,6 +37,9 @@ AXES: dict[str, Axis] = {
         Axis("n", input_group.c.n, "Sersic index of the host that was put in", is_number=True),
         Axis("r_eff", input_group.c.r_eff, "Half-light radius of the host that was put in", "arcsec", is_number=True),
         Axis("magnitude", input_group.c.magnitude, "Magnitude of the host that was put in", "AB mag", is_number=True),
+        Axis("host_kind", input_group.c.host_kind, "Kind of the host that was put in: sersic, image, spiral, ..."),
+        Axis("host_label", input_group.c.host_label, "Name of the host that was put in"),
+        Axis("deflector", input_group.c.deflector, "What the deflector has beside one profile and one power law"),
         Axis("noise_level", input_group.c.noise_level, "Noise of the simulation"),
         Axis("noise_treatment", input_group.c.noise_treatment, "Noise as the analysis takes it"),
         Axis("regularisation", input_group.c.regularisation, "Regularisation of the source"),
@@ -107,12 +110,21 @@ def axes_of_run(
     inputs: Mapping[str, Any], grid_id: str, profile: str | None, regularisation: str | None, engine: str | None
 ) -> dict[str, Any]:
     """The axes of a run, whether it has a result or not."""
-    return {**inputs, "grid": grid_id, "profile": profile, "regularisation": regularisation, "engine": engine}
+    return {
+        **USUAL_INPUTS,
+        **inputs,
+        "grid": grid_id,
+        "profile": profile,
+        "regularisation": regularisation,
+        "engine": engine,
+    }
 
 
 def _read(axis: Axis, text: str) -> Wanted:
+    if text == NONE and axis.column.nullable:
+        return None
     if not axis.is_number:
-        return None if text == NONE and axis.column.nullable else text
+        return text
     low, dots, high = text.partition("..")
     try:
         bounds = [float(bound) if bound else None for bound in (low, high if dots else low)]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Insert, Integer, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.store.tables import COUNTED, KEY_COLUMNS, SUMMED, grid_moments, input_group, input_moments
+from service.store.tables import COUNTED, KEY_COLUMNS, SUMMED, USUAL_INPUTS, grid_moments, input_group, input_moments
 
 _INSERT: dict[str, Callable[[Table], sqlite.Insert | postgresql.Insert]] = {
     "sqlite": sqlite.insert,
@@ -51,12 +51,13 @@ def add_to_inputs(connection: Connection, rows: Sequence[Mapping[str, Any]]) -> 
 
 @lru_cache(10_000)
 def _digest(values: tuple[Any, ...]) -> str:
-    named = {name: value for name, value in zip(KEY_COLUMNS, values, strict=True) if value is not None}
+    given = zip(KEY_COLUMNS, values, strict=True)
+    named = {name: value for name, value in given if value is not None and value != USUAL_INPUTS.get(name)}
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def input_digest(values: Iterable[Any]) -> str:
-    """What an input is known by within its grid, of its values of KEY_COLUMNS: a null is as if it had no column."""
+    """What an input is known by within its grid, of its values of KEY_COLUMNS: null or usual is as without a column."""
     return _digest(tuple(float(value) if isinstance(value, int) else value for value in values))
 
 
@@ -104,8 +105,9 @@ def _moments(
     true = np.array([_TRUE(row) for row in results], dtype=float)
     mean, sd, bias = (read[:, part : part + len(SUMMED)] for part in range(0, 3 * len(SUMMED), len(SUMMED)))
     known = ~np.isnan(bias)
-    # Sums are kept of the shift from the input: those of squares of a magnitude near 20 would lose its digits.
-    shift = np.nan_to_num(mean - true)
+    # Sums are kept of the shift from the input: those of squares of a magnitude near 20 would lose its digits. Where
+    # there is no input, from zero: an index is small.
+    shift = np.nan_to_num(mean - np.nan_to_num(true))
     bias = np.nan_to_num(bias)
     counted = np.concatenate([np.ones((len(read), 1)), np.nan_to_num(read[:, 3 * len(SUMMED) :])], axis=1)
     return {

@@ -30,7 +30,7 @@ from sqlalchemy.types import TypeEngine
 
 from service.domain.payload import COUNTS, ERRORS, LENS_PARAMETERS, QUANTITIES, WORK
 
-REVISION = "0012"
+REVISION = "0013"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -189,8 +189,10 @@ Index(
 
 INPUT_COLUMNS = (
     "system", "camera", "mass_model", "noise_level", "noise_treatment",
-    "l_eta", "n", "r_eff", "magnitude", "seed",
+    "l_eta", "n", "r_eff", "magnitude", "host_kind", "host_label", "deflector", "seed",
 )  # fmt: skip
+USUAL_INPUTS = {"host_kind": "sersic", "host_label": "sersic", "deflector": "plain"}
+"""Of runs from before there was anything else, whose inputs do not name these."""
 
 
 def _input_columns() -> list[Column[Any]]:
@@ -201,7 +203,11 @@ def _input_columns() -> list[Column[Any]]:
         "magnitude": Float(),
     }
     types["seed"] = BigInteger()
-    return [Column(name, types.get(name, String(64)), nullable=False) for name in INPUT_COLUMNS]
+    # A host that is no Sersic profile has no index.
+    return [
+        Column(name, types.get(name, String(64)), nullable=name == "n", server_default=USUAL_INPUTS.get(name))
+        for name in INPUT_COLUMNS
+    ]
 
 
 GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
