@@ -99,6 +99,7 @@ if TYPE_CHECKING:
         trend_series,
     )
     from engine.comparison import compare
+    from engine.conclusions import Conclusion, conclusions_markdown, study_conclusions, verdict
     from engine.experiment import inspect_simulation, run
     from engine.imaging.external import observation_from_arrays
     from engine.imaging.external_files import read_external_observation
@@ -125,6 +126,7 @@ else:
             "coverage_curve group_points mean_bias pull_summary serial_numbers trend_series"
         ),
         "engine.comparison": "compare",
+        "engine.conclusions": "Conclusion conclusions_markdown study_conclusions verdict",
         "engine.experiment": "inspect_simulation run",
         "engine.imaging.external": "observation_from_arrays",
         "engine.imaging.external_files": "read_external_observation",
@@ -173,6 +175,7 @@ __all__ = [
     "Camera",
     "CameraChoice",
     "ChainSummary",
+    "Conclusion",
     "Configuration",
     "CoverageCurve",
     "EngineError",
@@ -238,6 +241,7 @@ __all__ = [
     "check_system",
     "compare",
     "complaint",
+    "conclusions_markdown",
     "configuration_of",
     "coverage_curve",
     "engine_digest",
@@ -273,9 +277,11 @@ __all__ = [
     "simulate_realization",
     "spec_digest",
     "spec_error",
+    "study_conclusions",
     "system_facts",
     "system_from_mapping",
     "system_names",
     "trend_series",
+    "verdict",
     "write_observation",
 ]

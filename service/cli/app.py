@@ -20,6 +20,7 @@ from service.cli.figures import figures
 from service.cli.frontier import frontier
 from service.cli.measuring import measure
 from service.cli.replay import replay
+from service.cli.study import study
 from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
 
@@ -67,7 +68,7 @@ app = typer.Typer(
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, accuracy, measure, replay):
+for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, accuracy, measure, replay, study):
     app.command()(command)
 
 
