@@ -68,6 +68,12 @@ def _some(points: Sequence[BiasPoint], where: Select) -> list[BiasPoint]:
     return found
 
 
+def _require_several(*properties: FloatArray) -> None:
+    """A correlation needs values that differ."""
+    if any(np.unique(values).size < 2 for values in properties):
+        raise TooFewError("the runs do not differ in it")
+
+
 def _off(points: Sequence[BiasPoint], quantity: HostQuantity = "magnitude") -> FloatArray:
     return np.array([abs(point.bias(quantity)) for point in points])
 
@@ -227,6 +233,7 @@ def grows_with(against: Trend, sign: int = 1, where: Select = everything) -> Jud
     def judge(answers: Answers) -> Finding:
         some = _some(answers.free, lambda point: where(point) and getattr(point, against) is not None)
         x, y = np.array([sign * getattr(point, against) for point in some]), _off(some)
+        _require_several(x)
         value, error = float(_rank_correlation(x, y)), _error(_rank_correlation, x, y, paired=True)
         return Finding(f"rank correlation {_number(value, error, '')}", value > _SIGNIFICANT * error)
 
@@ -240,6 +247,7 @@ def matters_more(first: Mapping[Trend, int], than: Trend) -> Judge:
         some = _some(answers.free, lambda point: point.agn_contrast is not None)
         y = _off(some)
         columns = {name: np.array([float(getattr(point, name)) for point in some]) for name in (*first, than)}
+        _require_several(*columns.values())
         found = {name: float(_rank_correlation(first.get(name, 1) * x, y)) for name, x in columns.items()}
         apart = [
             _error(_difference, sign * columns[name], columns[than], y, paired=True) for name, sign in first.items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     import pyarrow
 
     from engine import Study
+    from service.cli.watch import Show
     from service.client import Client
     from service.domain.views import GridView
+
+    Guard = Callable[[Show], Show]
 
 SHIPPED = "shipped"
 FILE, TABLE = "study.parquet", "conclusions.md"
@@ -57,8 +60,9 @@ def study(
         require_readable([Path(source)])
     require_folder(output)
     if source is None:
-        with _service(None if local else url, token, data_dir) as client:
-            grids = _waited_for(client, grid or [_submit(client, preset, profile, seeds)], wait=not grid)
+        with _service(None if local else url, token, data_dir) as (client, guarded):
+            ids = grid or [_submit(client, preset, profile, seeds)]
+            grids = [client.status(one) for one in ids] if grid else [_ended(client, ids[0], guarded)]
             table = _collected(client, preset, grids)
         _write(table, output / FILE)
         source = str(output / FILE)
@@ -69,15 +73,15 @@ def study(
 
 
 @contextmanager
-def _service(url: str | None, token: str | None, data_dir: Path) -> Iterator[Client]:
-    """The service that is named, or one of its own for as long as it takes."""
+def _service(url: str | None, token: str | None, data_dir: Path) -> Iterator[tuple[Client, Guard]]:
+    """The service that is named, or one of its own for as long as it takes; and what ends a wait by Ctrl-C."""
     if url is not None:
         with connected(url, token) as client:
-            yield client
+            yield client, lambda show: show
         return
     import httpx  # noqa: PLC0415 - what a command needs it loads itself
 
-    from service.cli.own_service import own_service, wait_until_ready  # noqa: PLC0415 - as above
+    from service.cli.own_service import StoppedError, own_service, wait_until_ready  # noqa: PLC0415 - as above
     from service.client import ClientError  # noqa: PLC0415 - as above
     from service.runtime.installation import DidNotHappenError  # noqa: PLC0415 - as above
 
@@ -85,7 +89,10 @@ def _service(url: str | None, token: str | None, data_dir: Path) -> Iterator[Cli
         typer.echo(f"a service of its own at {service.client.url}, data in {data_dir}")
         try:
             wait_until_ready(service, stop)
-            yield service.client
+            yield service.client, stop.until
+        except StoppedError:
+            typer.echo("interrupted: the same command goes on from here")
+            raise typer.Exit(128 + stop.number) from None
         except (ClientError, DidNotHappenError, httpx.RequestError) as error:
             raise FailedError(str(error)) from error
 
@@ -93,20 +100,18 @@ def _service(url: str | None, token: str | None, data_dir: Path) -> Iterator[Cli
 def _submit(client: Client, preset: str, profile: str, seeds: int) -> str:
     """The grid of the study: for one engine the same one each time, so that what is interrupted goes on."""
     request = {"name": f"study {preset}", "preset": preset, "replicates": seeds, "analysis": {"profile": profile}}
-    key = f"study {preset} {profile} {seeds} {client.engine().digest[:16]}"
+    key = f"study:{preset}:{profile}:{seeds}:{client.engine().digest[:16]}"
     found = client.submit(request, key=key)
     typer.echo(f"grid {found.id}: {found.n_runs} runs, {found.counts.done} stored")
     return found.id
 
 
-def _waited_for(client: Client, grid_ids: Sequence[str], wait: bool) -> list[GridView]:
-    """The grids as they are, or once they have ended."""
-    if not wait:
-        return [client.status(one) for one in grid_ids]
+def _ended(client: Client, grid_id: str, guarded: Guard) -> GridView:
+    """The grid once it has ended."""
     from service.cli.watch import progress  # noqa: PLC0415 - as above
 
     with progress(console()) as show:
-        return client.wait_all(grid_ids, show)
+        return client.wait(grid_id, guarded(show))
 
 
 def _collected(client: Client, preset: str, grids: Sequence[GridView]) -> pyarrow.Table:
@@ -184,7 +189,7 @@ def _figures(found: Study, kind: Picture) -> Iterator[tuple[str, bytes]]:
     from engine.figures import bias_figure, figure_bytes, sample_figure  # noqa: PLC0415 - as above
 
     said = found.provenance
-    heading = f"{said['study']}, profile {', '.join(said['profiles'])}, {len(said['seeds'])} noise seed(s)"
+    heading = f"{said['study']}, profile {', '.join(said['profiles'])}, noise seed {', '.join(map(str, said['seeds']))}"
     for estimator, free in _SHOWN.items():
         points = found.points(estimator, free, "fixed")  # type: ignore[arg-type]
         for system in sorted({point.system for point in points}):
