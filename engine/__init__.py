@@ -99,7 +99,6 @@ if TYPE_CHECKING:
         trend_series,
     )
     from engine.comparison import compare
-    from engine.conclusions import Conclusion, conclusions_markdown, study_conclusions, verdict
     from engine.experiment import inspect_simulation, run
     from engine.imaging.external import observation_from_arrays
     from engine.imaging.external_files import read_external_observation
@@ -113,7 +112,16 @@ if TYPE_CHECKING:
     from engine.simulation.scene import check_analysis, check_system
     from engine.simulation.seeds import generator
     from engine.simulation.simulate import Simulation, simulate_realization
-    from engine.study import STUDY_FORMAT, STUDY_METADATA_KEY, Study, read_study
+    from engine.study import (
+        STUDY_FORMAT,
+        STUDY_METADATA_KEY,
+        Conclusion,
+        Study,
+        conclusions_markdown,
+        read_study,
+        study_conclusions,
+        verdict,
+    )
 else:
     _LATE = {
         "engine.acceptance": "check_realization",
@@ -126,7 +134,6 @@ else:
             "coverage_curve group_points mean_bias pull_summary serial_numbers trend_series"
         ),
         "engine.comparison": "compare",
-        "engine.conclusions": "Conclusion conclusions_markdown study_conclusions verdict",
         "engine.experiment": "inspect_simulation run",
         "engine.imaging.external": "observation_from_arrays",
         "engine.imaging.external_files": "read_external_observation",
@@ -140,7 +147,9 @@ else:
         "engine.simulation.scene": "check_analysis check_system",
         "engine.simulation.seeds": "generator",
         "engine.simulation.simulate": "Simulation simulate_realization",
-        "engine.study": "STUDY_METADATA_KEY STUDY_FORMAT Study read_study",
+        "engine.study": (
+            "STUDY_FORMAT STUDY_METADATA_KEY Conclusion Study conclusions_markdown read_study study_conclusions verdict"
+        ),
     }
     _HOME = {name: module for module, names in _LATE.items() for name in names.split()}
 

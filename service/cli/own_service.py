@@ -52,13 +52,12 @@ class Wanted(threading.Event):
 
 @contextmanager
 def own_service(settings: Settings) -> Iterator[tuple[Installation, Wanted]]:
-    """The supervised service on a free port, its data in ``settings.data_dir``, for as long as the context lasts.
+    """The supervised service on a free port of this machine, for as long as the context lasts.
 
-    The event is set when the user wants to stop. Nothing of the surroundings is used: no database, no store and no
-    address that ``HOSTLENS_*`` variables name.
+    The event is set when the user wants to stop. Cluster, database and store are those of the settings.
     """
     folder = settings.data_dir.absolute()
-    own = {"data_dir": folder, "database_url": None, "artefact_url": None, "host": "127.0.0.1", "port": free_port()}
+    own = {"data_dir": folder, "host": "127.0.0.1", "port": free_port(), "auth": None}
     settings = settings.model_copy(update=own)
     preflight.require_data(settings)
     wanted = Wanted()

@@ -51,8 +51,8 @@ def study(
 ) -> None:
     """Compute the paper's runs, and write their results, the figures and the table of conclusions.
 
-    By the service that --url names, or by one of its own. Interrupted, the same command goes on where it was.
-    Exit code 1 unless all runs have a result.
+    By the service that --url names, or by one of its own with the cluster of the settings. Interrupted, the same
+    command goes on where it was. Exit code 1 unless all runs have a result.
     """
     if source is not None and grid:
         raise typer.BadParameter("--grid: got one beside --from, allowed is one of them")

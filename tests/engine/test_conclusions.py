@@ -18,9 +18,10 @@ from engine import (
     system_names,
     verdict,
 )
-from engine.conclusions import STATEMENTS
 from engine.grid import Grid
-from engine.judgements import (
+from engine.result import Quantity
+from engine.study.conclusions import STATEMENTS
+from engine.study.judgements import (
     Answers,
     TooFewError,
     above_noise,
@@ -42,7 +43,6 @@ from engine.judgements import (
     values_within,
     within,
 )
-from engine.result import Quantity
 from tests.engine.bias_records import point
 
 PAGE = Path(__file__).parents[2] / "docs" / "tables" / "study.md"

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from engine.biases import BiasPoint
-from engine.judgements import (
+from engine.study.file import Study
+from engine.study.judgements import (
     ALIKE,
     INNER,
     MOST,
@@ -37,7 +38,6 @@ from engine.judgements import (
     values_within,
     within,
 )
-from engine.study import Study
 
 FAINT_ARC = 20.0
 """AB magnitude of the lensed host from which on the paper calls it faint."""
