@@ -188,14 +188,16 @@ def conclusions_markdown(study: Study) -> str:
 
 
 def _page(study: Study) -> Iterator[str]:
-    said, runs = study.provenance, len(set(study.table["run_id"].to_pylist()))
+    said = study.provenance
+    cpu_s = dict(zip(study.table["run_id"].to_pylist(), study.table["cpu_s"].to_pylist(), strict=True))
     found = study_conclusions(study)
     yield "# The paper's conclusions\n"
     yield (
-        f"Made by `hostlens study {said['study']} --from shipped`: {runs} of {said['runs_asked']} runs, profile "
+        f"Made by `hostlens study {said['study']} --from shipped`: {len(cpu_s)} of {said['runs_asked']} runs, profile "
         f"{_listed(said['profiles'])}, noise seeds {_listed(said['seeds'])}, engine "
-        f"{_listed(digest[:12] for digest in said['engines'])}. `paper` is the paper's estimator with n in 1-4, "
-        "`image` the recommended one with n in 0.3-8. Arcs are of each system's own filter, F160W or F814W.\n"
+        f"{_listed(digest[:12] for digest in said['engines'])}, {sum(cpu_s.values()) / 3600:.2f} hours of CPU time. "
+        "`paper` is the paper's estimator with n in 1-4, `image` the recommended one with n in 0.3-8; the inversion is "
+        "this engine's in both. Arcs are of each system's own filter, F160W or F814W.\n"
     )
     yield (
         f"Rules: biases are within a bound where {MOST:.0%} of them are. A median, a difference or a rank correlation "
