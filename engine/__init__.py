@@ -131,7 +131,16 @@ if TYPE_CHECKING:
     from engine.simulation.scene import check_analysis, check_system
     from engine.simulation.seeds import generator
     from engine.simulation.simulate import Simulation, simulate_realization
-    from engine.study import STUDY_FORMAT, STUDY_METADATA_KEY, Study, read_study
+    from engine.study import (
+        STUDY_FORMAT,
+        STUDY_METADATA_KEY,
+        Conclusion,
+        Study,
+        conclusions_markdown,
+        read_study,
+        study_conclusions,
+        verdict,
+    )
 else:
     _LATE = {
         "engine.acceptance": "check_realization",
@@ -166,7 +175,9 @@ else:
         "engine.simulation.scene": "check_analysis check_system",
         "engine.simulation.seeds": "generator",
         "engine.simulation.simulate": "Simulation simulate_realization",
-        "engine.study": "STUDY_METADATA_KEY STUDY_FORMAT Study read_study",
+        "engine.study": (
+            "STUDY_FORMAT STUDY_METADATA_KEY Conclusion Study conclusions_markdown read_study study_conclusions verdict"
+        ),
     }
     _HOME = {name: module for module, names in _LATE.items() for name in names.split()}
 
@@ -206,6 +217,7 @@ __all__ = [
     "CameraChoice",
     "ChainSummary",
     "Comparison",
+    "Conclusion",
     "Configuration",
     "CoverageCurve",
     "Deflector",
@@ -285,6 +297,7 @@ __all__ = [
     "compare",
     "compare_codes",
     "complaint",
+    "conclusions_markdown",
     "configuration_of",
     "coverage_curve",
     "engine_digest",
@@ -322,12 +335,14 @@ __all__ = [
     "simulate_realization",
     "spec_digest",
     "spec_error",
+    "study_conclusions",
     "system_facts",
     "system_from_mapping",
     "system_names",
     "traits_of",
     "traits_of_image",
     "trend_series",
+    "verdict",
     "write_coolest",
     "write_observation",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -17,6 +18,9 @@ from service.domain.views import (
     SummaryEstimate,
     SummaryValue,
 )
+
+if TYPE_CHECKING:
+    from engine import Conclusion
 
 _USUAL = ("sersic", "plain")
 _INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
@@ -71,6 +75,17 @@ def summary_table(summary: Summary) -> Table:
         "bias: recovered minus true; sd: spread of the draws of a run; by the image estimator where none is named; "
         "n in 1-4 for paper"
     )
+    return table
+
+
+def conclusions_table(found: Iterable[Conclusion]) -> Table:
+    """The paper's conclusions, and whether a study bears them out."""
+    from engine import verdict  # noqa: PLC0415 - only here
+
+    table = Table("section", "the paper says", "with paper", "with image", title="The paper's conclusions")
+    for one in found:
+        cells = [f"{verdict(finding)}: {finding.told}" for finding in (one.paper, one.recommended)]
+        table.add_row(one.statement.section, one.statement.says, *cells, end_section=True)
     return table
 
 
