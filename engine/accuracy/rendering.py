@@ -21,7 +21,7 @@ from engine.imaging.psf import detector_kernel
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_sersic
 from engine.light.sersic import SersicProfile
-from engine.simulation.simulate import optical_psf
+from engine.imaging.telescope import optical_psf
 
 STAGE = "rendering"
 INTEGRATION = Knob(

@@ -14,6 +14,7 @@ from engine.conventions import FloatArray, pixel_centres
 from engine.lensing.power_law import PowerLawLens
 from engine.parametric.model import ImageModel, weights_sigma
 from engine.parametric.model_error import learned
+from engine.parametric.optics_error import learned_optics
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.residual_noise import measured_stamp_error, noise_scale
@@ -26,6 +27,8 @@ SUBRAYS = 2
 _STEPS = 40
 _HOPELESS = 10.0
 """Times by which chi^2 may exceed what is accepted for errors of the model to be looked for in it."""
+_DOUBTFUL = 1.5
+"""Chi^2 per pixel from which on the optics are asked before a fit is made exact."""
 _ROUNDS = 3
 """Fits with errors of the model: each learns from the one before."""
 _SHEAR_SHOWS = 4.0
@@ -79,12 +82,35 @@ def polished(task: Task, solution: Solution) -> Solution:
         task = replace(task, observation=best.model.observation)
     if task.shear is None and not _shear_shows(best):
         best = full_fit(task, best, best.model.sigma, shear=False, shared=best.model.shared)
-    for _ in range(task.observation.optics.correction_rounds):
-        best = minimise(
-            best.model.corrected(best.values), best.start, best.values, NEAR_STEPS, TOLERANCE,
-            stamp_error=best.stamp_error,
-        )  # fmt: skip
-    return best
+    if best.cost < _DOUBTFUL * best.model.pixels:
+        best = _exactly(best)
+    refocused = _with_optics_learned(task, best)
+    return _exactly(best) if refocused is best and best.cost >= _DOUBTFUL * best.model.pixels else refocused
+
+
+def _exactly(solution: Solution) -> Solution:
+    """The fit with exact columns, as far as the optics know any (:meth:`~.model.ImageModel.corrected`)."""
+    for _ in range(solution.model.observation.optics.correction_rounds):
+        model = solution.model.corrected(solution.values)
+        found = minimise(
+            model, solution.start, solution.values, NEAR_STEPS, TOLERANCE, stamp_error=solution.stamp_error
+        )
+        solution = replace(found, error=solution.error)
+    return solution
+
+
+def _with_optics_learned(task: Task, solution: Solution) -> Solution:
+    """The fit with the telescope in the state that its AGN images ask for; the same where they ask for none."""
+    for _ in range(_ROUNDS):
+        found, response = learned_optics(solution), task.observation.response
+        if found is None or response is None:
+            break
+        other, psf = response.in_state(found.state), task.observation.psf
+        psf = psf + response.stamp_change(other, psf.shape[0] // 2)
+        task = replace(task, observation=replace(task.observation, psf=psf, response=other))
+        sigma = fitted_sigma(task, solution)
+        solution = _exactly(full_fit(task, solution, sigma, shear=solution.space.shear, shared=found.shared))
+    return solution
 
 
 def _with_model_error(task: Task, solution: Solution) -> Solution:

@@ -25,11 +25,12 @@ from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation, Provenance
 from engine.imaging.optics.exposed import ExposedOptics
-from engine.imaging.psf import detector_kernel, telescope_psf
+from engine.imaging.psf import detector_kernel
+from engine.imaging.telescope import optical_psf
 from engine.light.rendering import render_sersic
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.seeds import sky_generator
-from engine.spec.instrument import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
+from engine.spec.instrument import Camera, NoiseLevel
 from engine.spec.realization import Realization
 
 _PSF_REACH = 5.0
@@ -71,11 +72,6 @@ def scene_geometry(scene: Scene) -> Geometry:
     """Sampling of a scene's exposures and drizzled image."""
     side = scene.system.exposures.field_pixels
     return exposure_geometry(scene.camera, resolve_dither(scene.system), (side, side))
-
-
-def optical_psf(camera: Camera, oversampling: int, optics: Optics = NOMINAL_OPTICS) -> FloatArray:
-    """PSF of a camera on sub-pixels, computed once per process."""
-    return telescope_psf(camera, oversampling=oversampling, defocus_nm=optics.defocus_nm, jitter=optics.jitter)
 
 
 @lru_cache(maxsize=8)
@@ -145,7 +141,10 @@ def combine(scene: Scene, exposures: Exposures, provenance: Provenance | None = 
         provenance={**_exposure_record(scene, exposures), **(provenance or {})},
         centre=scene.system.coordinates,
         response=ExposedOptics(
-            optical_psf(scene.camera, geometry.oversampling), geometry, detector_kernel(scene.camera)
+            optical_psf(scene.camera, geometry.oversampling),
+            geometry,
+            detector_kernel(scene.camera),
+            camera=scene.camera,
         ),
     )
 
