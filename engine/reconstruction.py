@@ -167,8 +167,7 @@ def analyse(
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
                     real_galaxy=real_galaxy, centre=centre,
                 )  # fmt: skip
-        if fit.error is not None:
-            observation = replace(observation, psf=fit.psf)
+        observation = fit.seen_through(observation)
         inversion = _sampled(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:

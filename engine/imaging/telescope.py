@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+
+import numpy as np
+from scipy import ndimage
 
 from engine.conventions import FloatArray
 from engine.imaging.drizzled_psf import drizzled_psf
@@ -14,6 +17,9 @@ from engine.spec.instrument import NOMINAL_OPTICS, Camera, Optics
 
 _QUICK_PUPIL, _QUICK_SIDE = 128, 3.0
 """Pupil pixels and side [arcsec] of PSFs that are only compared with each other."""
+_RESIDUAL = 20172
+"""The stream of random residuals."""
+_SPECKLE = 0.42
 
 
 @dataclass(frozen=True)
@@ -21,19 +27,72 @@ class TelescopeState:
     """How a telescope departs from its nominal PSF, as far as it is known.
 
     ``defocus_nm`` is the focus error [nm rms of wavefront], ``blur`` the variance [arcsec^2 an axis] of what broadens
-    the PSF besides: jitter, charge diffusion; negative where the PSF is sharper than the nominal one.
+    the PSF besides: jitter, charge diffusion; negative where the PSF is sharper than the nominal one. ``colour`` is how
+    much bluer the sky is than the light that the PSF is taken for, as of :class:`~engine.spec.instrument.Optics`.
     """
 
     defocus_nm: float = 0.0
     blur: float = 0.0
+    colour: float = 0.0
 
 
 NOMINAL_STATE = TelescopeState()
 
 
+def _coloured(camera: Camera, colour: float) -> Camera:
+    """The camera with the throughput that light has for it whose photons go as wavelength^-colour."""
+    if not colour:
+        return camera
+    middle = float(np.mean(camera.wavelength_nm))
+    bluer = [(wavelength / middle) ** -colour for wavelength in camera.wavelength_nm]
+    return replace(camera, throughput=tuple(t * b for t, b in zip(camera.throughput, bluer, strict=True)))
+
+
+@lru_cache(maxsize=8)
 def optical_psf(camera: Camera, oversampling: int, optics: Optics = NOMINAL_OPTICS) -> FloatArray:
-    """PSF of a camera on sub-pixels, computed once per process."""
-    return telescope_psf(camera, oversampling=oversampling, defocus_nm=optics.defocus_nm, jitter=optics.jitter)
+    """PSF of a camera on sub-pixels, of the sky that ``optics`` spoil; computed once per process."""
+    psf = telescope_psf(
+        _coloured(camera, optics.colour),
+        oversampling=oversampling,
+        defocus_nm=optics.defocus_nm,
+        jitter=optics.jitter,
+    )
+    if optics.residual:
+        psf = with_residual(psf, camera, oversampling, optics.residual, optics.residual_seed)
+    return psf
+
+
+def with_residual(psf: FloatArray, camera: Camera, oversampling: int, rms: float, seed: int) -> FloatArray:
+    """A PSF times one plus a smooth random field of that rms over its light, with the same sum.
+
+    The field is a Gaussian process of the size of a speckle: its standard deviation is 0.42 lambda / D, that of a
+    Gaussian with the width of the diffraction pattern.
+    """
+    middle = float(np.mean(camera.wavelength_nm)) * 1e-9
+    speckle = math.degrees(middle / camera.pupil.primary_diameter_m) * 3600.0 * oversampling / camera.pixel_scale
+    white = np.random.default_rng([_RESIDUAL, seed]).normal(size=psf.shape)
+    field = ndimage.gaussian_filter(white, _SPECKLE * speckle / math.sqrt(2.0), mode="wrap")
+    field -= float((psf * field).sum() / psf.sum())
+    field *= rms / math.sqrt(float((psf * field**2).sum() / psf.sum()))
+    spoilt = psf * (1.0 + field)
+    spoilt.setflags(write=False)
+    return spoilt
+
+
+@lru_cache(maxsize=8)
+def known_psf(camera: Camera, oversampling: int, coarse: int = 1) -> FloatArray:
+    """The nominal PSF on sub-pixels as an analysis has it that knows its means over ``coarse`` sub-pixels a side."""
+    psf = optical_psf(camera, oversampling)
+    if coarse == 1:
+        return psf
+    # Means round the middle, and between them what the band allows: the star is put in their place by the same spline.
+    means = ndimage.uniform_filter(psf, coarse, mode="constant")
+    if coarse % 2 == 0:
+        # Its window has no middle element: half of the one behind, half of the one before.
+        means = 0.25 * sum(np.roll(means, (-j, -i), axis=(0, 1)) for j in (0, 1) for i in (0, 1))
+    means = means * (psf.sum() / means.sum())
+    means.setflags(write=False)
+    return means
 
 
 def state_psf(
@@ -43,8 +102,8 @@ def state_psf(
 
     def blurred(jitter: float) -> FloatArray:
         return telescope_psf(
-            camera, oversampling=oversampling, field_of_view=side, defocus_nm=state.defocus_nm, jitter=jitter,
-            pupil_pixels=pupil,
+            _coloured(camera, state.colour), oversampling=oversampling, field_of_view=side,
+            defocus_nm=state.defocus_nm, jitter=jitter, pupil_pixels=pupil,
         )  # fmt: skip
 
     broad = blurred(math.sqrt(abs(state.blur)))

@@ -205,6 +205,10 @@ class ImageModel:
         out.data = out._target
         return out
 
+    def missed(self, values: FloatArray) -> FloatArray:
+        """Whitened residuals (pixels,) without what shared errors explain of them."""
+        return self.exact_only().amplitudes(values)[1]
+
     def columns(self, values: FloatArray) -> FloatArray:
         """Whitened columns (pixels, amplitudes)."""
         space = self.space

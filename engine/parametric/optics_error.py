@@ -10,30 +10,33 @@ would explain, J being their derivatives: K' = (1 - J (J^T J)^-1 J^T) K.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
 
 from engine.conventions import FloatArray
 from engine.imaging.optics.exposed import ExposedOptics
-from engine.imaging.telescope import TelescopeState, quick_stamp
+from engine.imaging.telescope import NOMINAL_STATE, TelescopeState, quick_stamp
 from engine.parametric.model import ImageModel
 from engine.parametric.psf_error import laid_modes
 from engine.parametric.shared_error import SharedError
 from engine.parametric.solution import Solution
+from engine.spec.instrument import Camera
 
-DEFOCUS_SD, BLUR_SD = 15.0, 5e-5
-"""Prior of a telescope's state: HST's breathing [nm rms of wavefront]; 7 milliarcsec of jitter, as a variance."""
+DEFOCUS_SD, BLUR_SD, COLOUR_SD = 15.0, 5e-5, 1.0
+"""Prior of a telescope's state: HST's breathing [nm rms of wavefront]; 7 milliarcsec of jitter, as a variance
+[arcsec^2]; a star of another class."""
+_SD = np.array([DEFOCUS_SD, BLUR_SD, COLOUR_SD])
 _ASK = 20.0
 """Chi^2 of four ways in which a stamp may be wrong from which on it is asked: an exact PSF has it once in 2000 runs."""
 _GAIN = 8.0
 """ln of the evidence, in that of independent pixels, from which on another state is believed."""
-_STEP_NM, _STEP_BLUR = 5.0, 1e-4
-_FARTHEST_NM, _FARTHEST_BLUR = 60.0, 4e-4
+_STEP_NM, _STEP_BLUR, _STEP_COLOUR = 5.0, 1e-4, 1.0
+_FARTHEST_NM, _FARTHEST = 60.0, np.array([4e-4, 3.0])
 """Steps over which the PSF's derivatives are taken, and the farthest that these are trusted."""
 _STEPS = 6
-_SETTLED_NM, _SETTLED_BLUR = 0.2, 1e-6
+_SETTLED_NM, _SETTLED = 0.2, np.array([1e-6, 0.02])
 _SMOOTHED = 0.6
 
 
@@ -56,15 +59,31 @@ def learned_optics(solution: Solution) -> LearnedOptics | None:
     if response is None or response.camera is None or not solution.space.n_agn:
         return None
     seen = _Residual(solution)
-    if seen.chi2(seen.laid(_broader(solution.model.observation.psf))) < _ASK:
-        return None
-    search = _Search(seen, response)
-    found = min((search.nearest(defocus) for defocus in search.starts()), key=lambda pair: pair[1])[0]
+    search = _Search(seen, response, response.camera)
+    if not _asks(seen, solution):
+        # A search begun anew has a state that is right, but does not yet marginalise it.
+        anew = response.state != NOMINAL_STATE and solution.model.shared is None
+        return search.learned(response.state, _GAIN) if anew else None
+    found = search.nearest(response.state)
+    # On the other side of focus the PSF is much the same.
+    mirrored = replace(found, defocus_nm=-found.defocus_nm)
+    if search.cost(mirrored) < search.cost(found):
+        found = search.nearest(mirrored)
     gain = 0.5 * (search.cost(response.state) - search.cost(found)) / seen.excess(search.derivatives(found))
     if gain < _GAIN:
         return None
-    derivatives = seen.unwhitened(search.derivatives(found)) * np.array([DEFOCUS_SD, BLUR_SD])
-    return LearnedOptics(found, gain, SharedError(derivatives, np.zeros(2), 0))
+    return search.learned(found, gain)
+
+
+def stamp_is_wrong(solution: Solution) -> bool:
+    """Whether the residuals of a fit at its AGN images are such as no exact PSF leaves."""
+    if not solution.space.n_agn:
+        return False
+    return _asks(_Residual(solution), solution)
+
+
+def _asks(seen: _Residual, solution: Solution) -> bool:
+    return seen.chi2(seen.laid(_broader(solution.model.observation.psf))) >= _ASK
 
 
 def _broader(stamp: FloatArray) -> FloatArray:
@@ -129,12 +148,11 @@ class _Residual:
 class _Search:
     """The likeliest state of a telescope."""
 
-    def __init__(self, seen: _Residual, response: ExposedOptics) -> None:
-        self._seen, self._response = seen, response
+    def __init__(self, seen: _Residual, response: ExposedOptics, camera: Camera) -> None:
+        self._seen, self._response, self._camera = seen, response, camera
 
     def _stamp(self, state: TelescopeState) -> FloatArray:
-        assert self._response.camera is not None
-        return quick_stamp(self._response.camera, self._response.geometry, state)
+        return quick_stamp(self._camera, self._response.geometry, state)
 
     def _rest(self, state: TelescopeState) -> FloatArray:
         """Residuals of a fit whose AGN images are those of a state."""
@@ -144,31 +162,33 @@ class _Search:
     def cost(self, state: TelescopeState) -> float:
         """Chi^2 with its prior."""
         rest = self._rest(state)
-        return float(rest @ rest) + _prior(state.defocus_nm, state.blur)
+        return float(rest @ rest) + float(np.sum((_values(state) / _SD) ** 2))
 
     def _changes(self, state: TelescopeState) -> FloatArray:
-        """Derivatives (3, n, n) of the stamp by defocus, by half its square, and by blur."""
+        """Derivatives (4, n, n) of the stamp by defocus, by half its square, by blur and by colour."""
         here = self._stamp(state)
         more, less = (
-            self._stamp(TelescopeState(state.defocus_nm + step, state.blur)) for step in (_STEP_NM, -_STEP_NM)
+            self._stamp(replace(state, defocus_nm=state.defocus_nm + step)) for step in (_STEP_NM, -_STEP_NM)
         )
         # To the side on which the PSF is computed, not extrapolated.
         step = _STEP_BLUR if state.blur >= 0.0 else -_STEP_BLUR
-        blurred = (self._stamp(TelescopeState(state.defocus_nm, state.blur + step)) - here) / step
-        return np.stack([(more - less) / (2.0 * _STEP_NM), (more + less - 2.0 * here) / _STEP_NM**2, blurred])
+        blurred = (self._stamp(replace(state, blur=state.blur + step)) - here) / step
+        # This one hardly depends on the others, and need not be computed again.
+        usual = self._response.state
+        bluer = (self._stamp(replace(usual, colour=usual.colour + _STEP_COLOUR)) - self._stamp(usual)) / _STEP_COLOUR
+        return np.stack([(more - less) / (2.0 * _STEP_NM), (more + less - 2.0 * here) / _STEP_NM**2, blurred, bluer])
 
     def derivatives(self, state: TelescopeState) -> FloatArray:
-        """Whitened columns (pixels, 2) of the derivatives by defocus and by blur."""
-        return self._seen.laid(self._changes(state)[[0, 2]])
+        """Whitened columns (pixels, 3) of the derivatives by defocus, blur and colour."""
+        return self._seen.laid(self._changes(state)[[0, 2, 3]])
 
-    def starts(self) -> tuple[float, ...]:
-        """Defocus [nm] to start from: where it is, and on the other side, as the PSF hardly tells the two apart."""
-        here = self._step(self._response.state)[0]
-        return (here.defocus_nm, -here.defocus_nm)
+    def learned(self, state: TelescopeState, gain: float) -> LearnedOptics:
+        """A state with the columns of its prior, of whose amplitudes the fit has none yet."""
+        columns = self._seen.unwhitened(self.derivatives(state)) * _SD
+        return LearnedOptics(state, gain, SharedError(columns, np.zeros(_SD.size), 0))
 
-    def nearest(self, defocus: float) -> tuple[TelescopeState, float]:
-        """The minimum that steps from a defocus lead to, and its cost."""
-        state = TelescopeState(defocus, self._response.state.blur)
+    def nearest(self, state: TelescopeState) -> TelescopeState:
+        """The minimum that steps from a state lead to."""
         cost = self.cost(state)
         for _ in range(_STEPS):
             following, moved = self._step(state)
@@ -178,25 +198,28 @@ class _Search:
             state, cost = following, lower
             if not moved:
                 break
-        return state, cost
+        return state
 
     def _step(self, state: TelescopeState) -> tuple[TelescopeState, bool]:
-        """The minimum of cost to second order in defocus and first in blur, and whether it is elsewhere."""
+        """The minimum of cost to second order in defocus and first in the others, and whether it is elsewhere."""
         columns, rest = self._seen.laid(self._changes(state)), self._rest(state)
         square, along = columns.T @ columns, columns.T @ rest
         d = np.arange(-_FARTHEST_NM, _FARTHEST_NM + 0.05, 0.1)
         defocus = np.stack([d, 0.5 * d**2])
-        # For each defocus the best blur is known.
-        stiff = square[2, 2] + BLUR_SD**-2
-        v = (along[2] - square[2, :2] @ defocus - state.blur / BLUR_SD**2) / stiff
-        v = np.clip(v, -_FARTHEST_BLUR, _FARTHEST_BLUR)
-        a = np.concatenate([defocus, v[None]])
-        cost = np.sum(a * (square @ a), axis=0) - 2.0 * along @ a + _prior(state.defocus_nm + d, state.blur + v)
+        # For each defocus the best of the others are known.
+        others, sd = _values(state)[1:, None], _SD[1:, None]
+        stiff = square[2:, 2:] + np.diag(_SD[1:] ** -2)
+        v = np.linalg.solve(stiff, along[2:, None] - square[2:, :2] @ defocus - others / sd**2)
+        v = np.clip(v, -_FARTHEST[:, None], _FARTHEST[:, None])
+        a = np.concatenate([defocus, v])
+        cost = np.sum(a * (square @ a), axis=0) - 2.0 * along @ a
+        cost += ((state.defocus_nm + d) / DEFOCUS_SD) ** 2 + np.sum(((others + v) / sd) ** 2, axis=0)
         best = int(np.argmin(cost))
-        moved = abs(d[best]) > _SETTLED_NM or abs(v[best]) > _SETTLED_BLUR
+        moved = abs(d[best]) > _SETTLED_NM or bool(np.any(np.abs(v[:, best]) > _SETTLED))
+        blur, colour = (others[:, 0] + v[:, best]).tolist()
         # Rounded, so that stamps are found again.
-        return TelescopeState(round(state.defocus_nm + float(d[best]), 1), round(state.blur + float(v[best]), 7)), moved
+        return TelescopeState(round(state.defocus_nm + float(d[best]), 1), round(blur, 7), round(colour, 3)), moved
 
 
-def _prior(defocus: FloatArray | float, blur: FloatArray | float) -> FloatArray | float:
-    return (defocus / DEFOCUS_SD) ** 2 + (blur / BLUR_SD) ** 2
+def _values(state: TelescopeState) -> FloatArray:
+    return np.array([state.defocus_nm, state.blur, state.colour])

@@ -140,14 +140,21 @@ CameraChoice = Annotated[
 
 @dataclass(frozen=True, config=STRICT)
 class Optics:
-    """How the telescope departs from its nominal PSF, for simulating a PSF that the analysis does not know.
+    """How the PSF of the sky departs from the one that the analysis is given.
 
     ``defocus_nm`` is the focus error [nm rms of wavefront]; 1 micron of HST's secondary mirror is 6 nm, its breathing
-    about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis].
+    about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis]. ``colour`` is how much bluer than the star of
+    the analysis's PSF the sky is: its photons per nm go as wavelength^-colour beside the star's. ``residual`` is a
+    smooth random error of the PSF, rms as a part of its light, drawn by ``residual_seed``. ``coarse`` is the side
+    [sub-pixels of the simulation] of the pixels on which the analysis knows its PSF: it is the mean over them.
     """
 
     defocus_nm: Annotated[Number, Field(ge=-500.0, le=500.0), UNSIGNED] = 0.0
     jitter: Annotated[Number, Field(ge=0.0, le=0.5), UNSIGNED] = 0.0
+    colour: Annotated[Number, Field(ge=-20.0, le=20.0), UNSIGNED] = 0.0
+    residual: Annotated[Number, Field(ge=0.0, le=0.2), UNSIGNED] = 0.0
+    residual_seed: Annotated[Count, Field(ge=0, le=2**32 - 1)] = 0
+    coarse: Annotated[Count, Field(ge=1, le=12)] = 1
 
 
 NOMINAL_OPTICS = Optics()
