@@ -51,7 +51,7 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import PROFILES, Analysis
-from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
+from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, NoiseLevel, Optics, OpticsChoice
 from engine.spec.json_text import read_json
 from engine.spec.priors import ParameterPrior
 from engine.spec.quantities import Identifier
@@ -156,6 +156,7 @@ __all__ = [
     "BIN_WIDTH",
     "GROUPINGS",
     "HOST_QUANTITIES",
+    "NOMINAL_OPTICS",
     "PRINTABLE",
     "PROFILES",
     "STAGES",
@@ -196,6 +197,7 @@ __all__ = [
     "Observation",
     "ObservationError",
     "Optics",
+    "OpticsChoice",
     "ParameterPrior",
     "PosteriorError",
     "Products",

@@ -23,7 +23,7 @@ from engine.catalogue import (
 )
 from engine.errors import SpecError
 from engine.spec.analysis import Analysis
-from engine.spec.instrument import Camera, CameraChoice, Dither, NoiseLevel, Optics
+from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, Dither, NoiseLevel, Optics, OpticsChoice
 from engine.spec.quantities import Count, Identifier, Magnitude, Radius, SersicIndex, Slope
 from engine.spec.realization import Realization
 from engine.spec.sky import Host, LensSystem, SystemChoice
@@ -49,8 +49,8 @@ class Grid:
     With ``preset`` (``h0licow-vi`` for all eight systems, ``h0licow-vi/HE0435`` for one) the values are those of the
     paper's Table 2, and n, r_eff, magnitude, l_eta cut them: each must then be a subset of the preset's values.
     Without it, ``systems`` (names of the catalogue, or lens systems of one's own) and all four lists of values must be
-    given and every combination is run. ``camera`` takes the place of the systems' own. ``replicates`` repeats each
-    point with seeds seed, seed + 1, ...
+    given and every combination is run. ``camera`` takes the place of the systems' own. ``optics`` spoil the
+    PSF of the sky: each point is run with each of them, {} being nothing. ``replicates`` repeats each point with seeds seed, seed + 1, ...
     """
 
     preset: Identifier | None = None
@@ -61,7 +61,7 @@ class Grid:
     l_eta: Slopes | None = None
     mass_model: Identifier = "recommended"
     noise_level: NoiseLevel = "author"
-    optics: Optics | None = None
+    optics: OpticsChoice | None = None
     seed: FirstSeed = 0
     replicates: Replicates = 1
     analysis: Analysis = Field(default_factory=Analysis)
@@ -97,13 +97,13 @@ class Expansion:
 
     def __init__(self, grid: Grid) -> None:
         _require_own_names(grid)
-        self._grid = grid
+        self._grid, self._optics = grid, _each_optics(grid)
         self._paper = None if grid.preset is None else _paper_points(grid)
         samples = list(_samples(grid)) if self._paper is None else self._paper
         by_setting = {(_name(system), l_eta): (system, number, host, l_eta) for system, number, host, l_eta in samples}
         counts = Counter((_name(system), l_eta) for system, _, _, l_eta in samples)
         _require_known_parts(grid, list(by_setting.values()))
-        self.samples = tuple(self._run(point, 0) for point in by_setting.values())
+        self.samples = tuple(self._run(point, 0, self._optics[0]) for point in by_setting.values())
         each = len(self) // len(samples)
         self.shares = tuple(counts[setting] * each for setting in by_setting)
 
@@ -111,15 +111,15 @@ class Expansion:
         """How many runs there are."""
         lists = (self._grid.systems, self._grid.n, self._grid.r_eff, self._grid.magnitude, self._grid.l_eta)
         points = prod(len(values or ()) for values in lists) if self._paper is None else len(self._paper)
-        return points * self._grid.replicates
+        return points * len(self._optics) * self._grid.replicates
 
     def __iter__(self) -> Iterator[GridRun]:
         """Make the runs, anew each time."""
         for point in _free_points(self._grid) if self._paper is None else self._paper:
-            for replicate in range(self._grid.replicates):
-                yield self._run(point, replicate)
+            for optics, replicate in product(self._optics, range(self._grid.replicates)):
+                yield self._run(point, replicate, optics)
 
-    def _run(self, point: _Point, replicate: int) -> GridRun:
+    def _run(self, point: _Point, replicate: int, optics: Optics | None) -> GridRun:
         (system, number, host, l_eta), grid = point, self._grid
         realization = Realization(
             system=system,
@@ -127,13 +127,14 @@ class Expansion:
             host=host,
             seed=grid.seed + replicate,
             noise_level=grid.noise_level,
-            optics=grid.optics,
+            optics=optics,
             mass_model=grid.mass_model,
             camera=grid.camera,
             analysis=grid.analysis,
         )
         name = f"{number:02d}" if number is not None else f"n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{l_eta:g}"
-        suffix = f"#{replicate + 1}" if grid.replicates > 1 else ""
+        suffix = f"_{(optics or NOMINAL_OPTICS).label}" if len(self._optics) > 1 else ""
+        suffix += f"#{replicate + 1}" if grid.replicates > 1 else ""
         return GridRun(label=f"{realization.system_name}/{name}{suffix}", paper_run=number, realization=realization)
 
 
@@ -153,6 +154,15 @@ def _require_own_names(grid: Grid) -> None:
         dither = system.exposures.dither
         if isinstance(dither, Dither) and dither.name in dither_names():
             raise SpecError(f"{where}.exposures.dither.name", dither.name, "a name that the catalogue does not have")
+
+
+def _each_optics(grid: Grid) -> tuple[Optics | None, ...]:
+    """What the points are run with; in a list, optics that spoil nothing are the same as none."""
+    if not isinstance(grid.optics, tuple):
+        return (grid.optics,)
+    if len(set(grid.optics)) != len(grid.optics):
+        raise SpecError("optics", [one.label for one in grid.optics], "a list without repeated values")
+    return tuple(None if one == NOMINAL_OPTICS else one for one in grid.optics)
 
 
 def _require_own_camera(camera: str | Camera | None, where: str) -> None:

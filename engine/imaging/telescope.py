@@ -74,7 +74,7 @@ def with_residual(psf: FloatArray, camera: Camera, oversampling: int, rms: float
     field = ndimage.gaussian_filter(white, _SPECKLE * speckle / math.sqrt(2.0), mode="wrap")
     field -= float((psf * field).sum() / psf.sum())
     field *= rms / math.sqrt(float((psf * field**2).sum() / psf.sum()))
-    spoilt = psf * (1.0 + field)
+    spoilt = np.asarray(psf * (1.0 + field))
     spoilt.setflags(write=False)
     return spoilt
 
@@ -90,7 +90,7 @@ def known_psf(camera: Camera, oversampling: int, coarse: int = 1) -> FloatArray:
     if coarse % 2 == 0:
         # Its window has no middle element: half of the one behind, half of the one before.
         means = 0.25 * sum(np.roll(means, (-j, -i), axis=(0, 1)) for j in (0, 1) for i in (0, 1))
-    means = means * (psf.sum() / means.sum())
+    means = np.asarray(means * (psf.sum() / means.sum()))
     means.setflags(write=False)
     return means
 

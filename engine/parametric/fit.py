@@ -42,7 +42,7 @@ GOOD_START = Acceptance()
 _N = COORDINATES.index("n")
 _DOUBTFUL = 1.5
 """chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
-_SEARCHES = 3
+_SEARCHES = 4
 """How often the optics may be learned and the search begun anew."""
 
 

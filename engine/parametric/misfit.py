@@ -24,7 +24,7 @@ def shared_noise(observation: Observation) -> FloatArray:
     out[_REACH, _REACH] = 1.0
     if observation.covariance is None:
         return out
-    ny, nx = observation.shape
+    nx = observation.shape[1]
     noise = np.where(observation.valid, observation.noise, np.inf).ravel()
     elements = observation.covariance.tocoo()
     down, across = elements.row // nx - elements.col // nx, elements.row % nx - elements.col % nx

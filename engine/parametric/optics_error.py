@@ -120,8 +120,9 @@ class _Residual:
 
     def laid(self, modes: FloatArray) -> FloatArray:
         """Columns (pixels, m) of changes of the stamp (m, n, n), without what the fit's parameters explain."""
-        return self._free(laid_modes(modes, self._places, self._model.shape).reshape(len(modes), -1).T
-                          * self._model.weight[:, None])
+        return self._free(
+            laid_modes(modes, self._places, self._model.shape).reshape(len(modes), -1).T * self._model.weight[:, None]
+        )
 
     def unwhitened(self, columns: FloatArray) -> FloatArray:
         weight = self._model.weight[:, None]
@@ -167,9 +168,7 @@ class _Search:
     def _changes(self, state: TelescopeState) -> FloatArray:
         """Derivatives (4, n, n) of the stamp by defocus, by half its square, by blur and by colour."""
         here = self._stamp(state)
-        more, less = (
-            self._stamp(replace(state, defocus_nm=state.defocus_nm + step)) for step in (_STEP_NM, -_STEP_NM)
-        )
+        more, less = (self._stamp(replace(state, defocus_nm=state.defocus_nm + step)) for step in (_STEP_NM, -_STEP_NM))
         # To the side on which the PSF is computed, not extrapolated.
         step = _STEP_BLUR if state.blur >= 0.0 else -_STEP_BLUR
         blurred = (self._stamp(replace(state, blur=state.blur + step)) - here) / step

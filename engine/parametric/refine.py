@@ -30,10 +30,12 @@ _HOPELESS = 10.0
 """Times by which chi^2 may exceed what is accepted for errors of the model to be looked for in it."""
 _DOUBTFUL = 1.5
 """Chi^2 per pixel from which on the optics are asked before a fit is made exact."""
+_MISLED = 20.0
+"""Chi^2 per pixel from which on a fit by a wrong PSF has led elsewhere, so that another would end there too."""
 _ROUNDS = 3
 """Fits with errors of the model: each learns from the one before."""
 _ASKED = 4.0
-"""Deviations by which residuals differ from noise from which on errors of the model of known exposures are looked for."""
+"""Deviations of residuals from noise from which on errors of the model of known exposures are looked for."""
 _SHINING = 3.0
 """Light in that of the noise from which on a pixel may tell of such errors."""
 _SHEAR_SHOWS = 4.0
@@ -90,7 +92,10 @@ def polished(task: Task, solution: Solution) -> Solution:
     if best.cost < _DOUBTFUL * best.model.pixels:
         best = _exactly(best)
     if task.observation.response is not None:
-        known = _with_exposures_learned(task, _with_state_learned(task, best))
+        state = _with_state_learned(task, best)
+        if state is not best and best.cost > _MISLED * best.model.pixels:
+            return state
+        known = _with_exposures_learned(task, state)
         best = _exactly(best) if known is best and best.cost >= _DOUBTFUL * best.model.pixels else known
     return best
 
@@ -115,6 +120,9 @@ def _with_state_learned(task: Task, solution: Solution) -> Solution:
         other, psf = response.in_state(found.state), task.observation.psf
         psf = psf + response.stamp_change(other, psf.shape[0] // 2)
         task = replace(task, observation=replace(task.observation, psf=psf, response=other))
+        if solution.cost > _MISLED * solution.model.pixels:
+            # Nothing but the state of the telescope is worth keeping of it: a search begins anew from there.
+            return full_fit(task, solution, fitted_sigma(task, solution), shear=solution.space.shear, steps=1)
         solution = _exactly(_refitted(task, solution, found.shared))
     return solution
 
@@ -185,7 +193,13 @@ def _noise_excess(task: Task, solution: Solution) -> FloatArray:
 
 
 def full_fit(
-    task: Task, solution: Solution, sigma: FloatArray, *, shear: bool, shared: SharedError | None = None
+    task: Task,
+    solution: Solution,
+    sigma: FloatArray,
+    *,
+    shear: bool,
+    shared: SharedError | None = None,
+    steps: int = _STEPS,
 ) -> Solution:
     """The fit of the whole image that begins where another ended."""
     ny, nx = task.observation.shape
@@ -196,7 +210,7 @@ def full_fit(
         galaxy=solution.model.galaxy,
     )  # fmt: skip
     values = solution.space.with_shear(solution.values, shear=shear)
-    found = minimise(model, solution.start, values, _STEPS, TOLERANCE, stamp_error=solution.stamp_error)
+    found = minimise(model, solution.start, values, steps, TOLERANCE, stamp_error=solution.stamp_error)
     return replace(found, error=solution.error)
 
 

@@ -23,7 +23,7 @@ from engine.spec.quantities import (
     Scale,
     Shift,
 )
-from engine.spec.validation import NAME_TAG, OBJECT_TAG, name_or_object
+from engine.spec.validation import LIST_TAG, NAME_TAG, OBJECT_TAG, name_or_object, one_or_list
 
 PupilCoordinate = Annotated[Number, Field(ge=-2.0, le=2.0), UNSIGNED]
 Waves = Annotated[Number, Field(ge=-10.0, le=10.0), UNSIGNED]
@@ -156,5 +156,24 @@ class Optics:
     residual_seed: Annotated[Count, Field(ge=0, le=2**32 - 1)] = 0
     coarse: Annotated[Count, Field(ge=1, le=12)] = 1
 
+    @property
+    def label(self) -> str:
+        """What tells it apart, in short: ``d20_j0.005``; ``nominal`` where nothing is spoilt."""
+        parts = (
+            f"{letter}{getattr(self, name):g}"
+            for letter, name in _LETTERS.items()
+            if getattr(self, name) != getattr(NOMINAL_OPTICS, name)
+        )
+        return "_".join(parts) or "nominal"
 
+
+_LETTERS = {
+    "d": "defocus_nm", "j": "jitter", "c": "colour", "r": "residual", "s": "residual_seed", "k": "coarse"
+}  # fmt: skip
+OpticsChoice = Annotated[
+    Annotated[Optics, Tag(OBJECT_TAG)]
+    | Annotated[tuple[Optics, ...], Field(min_length=1, max_length=100), Tag(LIST_TAG)],
+    Discriminator(one_or_list),
+]
+"""One way in which the PSF is spoilt, or several."""
 NOMINAL_OPTICS = Optics()

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, StringConstraints, create_model
 
 import engine
 from engine import (
+    NOMINAL_OPTICS,
     PRINTABLE,
     Analysis,
     CameraChoice,
@@ -28,7 +29,7 @@ from engine import (
     LensSystem,
     Magnitudes,
     NoiseLevel,
-    Optics,
+    OpticsChoice,
     Radii,
     Realization,
     Replicates,
@@ -44,7 +45,7 @@ from engine import (
     system_facts,
     system_names,
 )
-from service.domain.plan import Kind, PlannedRun
+from service.domain.plan import OPTICS_AXES, Kind, PlannedRun
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
 
 CONFIGURATIONS = {2: "double", 4: "quad"}
@@ -72,8 +73,8 @@ class GridRequest(BaseModel):
 
     With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
     lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
-    so is ``camera``, which takes the place of the systems' own. ``replicates`` repeats each point with seeds seed,
-    seed + 1, ...
+    so is ``camera``, which takes the place of the systems' own. ``optics``, one or a list of them, spoil the
+    PSF of the sky; each point is run with each. ``replicates`` repeats each point with seeds seed, seed + 1, ...
     """
 
     model_config = _CONFIG
@@ -87,7 +88,7 @@ class GridRequest(BaseModel):
     l_eta: Slopes | None = None
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
-    optics: Optics | None = None
+    optics: OpticsChoice | None = None
     camera: CameraChoice | None = None
     seed: FirstSeed = 0
     replicates: Replicates = 1
@@ -140,7 +141,8 @@ def plan(request: GridRequest, max_runs: int) -> Plan:
     # Before anything is looked at: a few lists can mean more systems and slopes than there is time for.
     lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
     if request.preset is None:
-        _limit(math.prod(len(values or ()) for values in lists) * request.replicates, max_runs)
+        each = len(request.optics) if isinstance(request.optics, tuple) else 1
+        _limit(math.prod(len(values or ()) for values in lists) * each * request.replicates, max_runs)
     _check_own_systems(request)
     runs = Expansion(_grid(request))
     _limit(len(runs), max_runs)
@@ -217,6 +219,7 @@ def _planned(run: GridRun) -> PlannedRun:
         "n": realization.host.n,
         "r_eff": realization.host.r_eff,
         "magnitude": realization.host.magnitude,
+        **{name: getattr(realization.optics or NOMINAL_OPTICS, name) for name in OPTICS_AXES},
         "seed": realization.seed,
     }
     spec = realization.to_dict()

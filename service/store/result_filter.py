@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy import Column, ColumnElement, Select, and_, case, or_, select
 
-from service.store.tables import input_group, run
+from service.store.tables import USUAL_INPUTS, input_group, run
 
 NONE = "none"
 """How a value that is not there is written, in a filter and in an answer's link."""
@@ -37,6 +37,17 @@ AXES: dict[str, Axis] = {
         Axis("n", input_group.c.n, "Sersic index of the host that was put in", is_number=True),
         Axis("r_eff", input_group.c.r_eff, "Half-light radius of the host that was put in", "arcsec", is_number=True),
         Axis("magnitude", input_group.c.magnitude, "Magnitude of the host that was put in", "AB mag", is_number=True),
+        Axis(
+            "defocus_nm",
+            input_group.c.defocus_nm,
+            "Focus error of the telescope, rms of wavefront",
+            "nm",
+            is_number=True,
+        ),
+        Axis("jitter", input_group.c.jitter, "Pointing jitter, rms an axis", "arcsec", is_number=True),
+        Axis("colour", input_group.c.colour, "How much bluer the sky is than the star of the PSF", is_number=True),
+        Axis("residual", input_group.c.residual, "Random error of the PSF, as a part of its light", is_number=True),
+        Axis("coarse", input_group.c.coarse, "Sub-pixels a side on which the PSF is known", is_number=True),
         Axis("noise_level", input_group.c.noise_level, "Noise of the simulation"),
         Axis("noise_treatment", input_group.c.noise_treatment, "Noise as the analysis takes it"),
         Axis("regularisation", input_group.c.regularisation, "Regularisation of the source"),
@@ -107,7 +118,14 @@ def axes_of_run(
     inputs: Mapping[str, Any], grid_id: str, profile: str | None, regularisation: str | None, engine: str | None
 ) -> dict[str, Any]:
     """The axes of a run, whether it has a result or not."""
-    return {**inputs, "grid": grid_id, "profile": profile, "regularisation": regularisation, "engine": engine}
+    return {
+        **USUAL_INPUTS,
+        **inputs,
+        "grid": grid_id,
+        "profile": profile,
+        "regularisation": regularisation,
+        "engine": engine,
+    }
 
 
 def _read(axis: Axis, text: str) -> Wanted:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Insert, Integer, Table
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.store.tables import COUNTED, KEY_COLUMNS, SUMMED, grid_moments, input_group, input_moments
+from service.store.tables import COUNTED, KEY_COLUMNS, SUMMED, USUAL_INPUTS, grid_moments, input_group, input_moments
 
 _INSERT: dict[str, Callable[[Table], sqlite.Insert | postgresql.Insert]] = {
     "sqlite": sqlite.insert,
@@ -51,12 +51,13 @@ def add_to_inputs(connection: Connection, rows: Sequence[Mapping[str, Any]]) -> 
 
 @lru_cache(10_000)
 def _digest(values: tuple[Any, ...]) -> str:
-    named = {name: value for name, value in zip(KEY_COLUMNS, values, strict=True) if value is not None}
+    given = zip(KEY_COLUMNS, values, strict=True)
+    named = {name: value for name, value in given if value is not None and value != USUAL_INPUTS.get(name)}
     return hashlib.sha256(json.dumps(named, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def input_digest(values: Iterable[Any]) -> str:
-    """What an input is known by within its grid, of its values of KEY_COLUMNS: a null is as if it had no column."""
+    """What an input is known by within its grid, of its values of KEY_COLUMNS: null or usual is as without a column."""
     return _digest(tuple(float(value) if isinstance(value, int) else value for value in values))
 
 

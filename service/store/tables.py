@@ -29,8 +29,9 @@ from sqlalchemy import (
 from sqlalchemy.types import TypeEngine
 
 from service.domain.payload import COUNTS, ERRORS, LENS_PARAMETERS, QUANTITIES, WORK
+from service.domain.plan import OPTICS_AXES
 
-REVISION = "0011"
+REVISION = "0014"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -185,8 +186,10 @@ Index(
 
 INPUT_COLUMNS = (
     "system", "camera", "mass_model", "noise_level", "noise_treatment",
-    "l_eta", "n", "r_eff", "magnitude", "seed",
+    "l_eta", "n", "r_eff", "magnitude", *OPTICS_AXES, "seed",
 )  # fmt: skip
+USUAL_INPUTS: dict[str, Any] = {**OPTICS_AXES}
+"""Of runs from before there was anything else, whose inputs do not name these."""
 
 
 def _input_columns() -> list[Column[Any]]:
@@ -196,8 +199,13 @@ def _input_columns() -> list[Column[Any]]:
         "r_eff": Float(),
         "magnitude": Float(),
     }
+    types |= dict.fromkeys(OPTICS_AXES, Float())
     types["seed"] = BigInteger()
-    return [Column(name, types.get(name, String(64)), nullable=False) for name in INPUT_COLUMNS]
+    usual = {name: str(value) for name, value in USUAL_INPUTS.items()}
+    return [
+        Column(name, types.get(name, String(64)), nullable=False, server_default=usual.get(name))
+        for name in INPUT_COLUMNS
+    ]
 
 
 GROUP_COLUMNS = tuple(name for name in INPUT_COLUMNS if name != "seed")
