@@ -49,8 +49,9 @@ class Grid:
     With ``preset`` (``h0licow-vi`` for all eight systems, ``h0licow-vi/HE0435`` for one) the values are those of the
     paper's Table 2, and n, r_eff, magnitude, l_eta cut them: each must then be a subset of the preset's values.
     Without it, ``systems`` (names of the catalogue, or lens systems of one's own) and all four lists of values must be
-    given and every combination is run. ``camera`` takes the place of the systems' own. ``optics`` spoil the
-    PSF of the sky: each point is run with each of them, {} being nothing. ``replicates`` repeats each point with seeds seed, seed + 1, ...
+    given and every combination is run. ``camera`` takes the place of the systems' own. ``optics``, one or several,
+    spoil the PSF of the sky: each point is run with each, {} being nothing. ``replicates`` repeats each point with
+    seeds seed, seed + 1, ...
     """
 
     preset: Identifier | None = None
