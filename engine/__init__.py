@@ -97,6 +97,9 @@ if TYPE_CHECKING:
         serial_numbers,
         trend_series,
     )
+    from engine.calibration import Calibration, calibrate
+    from engine.codes.compare import Comparison, compare_codes
+    from engine.codes.coolest import write_coolest
     from engine.comparison import compare
     from engine.experiment import inspect_simulation, run
     from engine.imaging.external import observation_from_arrays
@@ -122,6 +125,9 @@ else:
             "HostQuantity PullSummary Spread Trend TrendBin TrendSeries bias_points configuration_of "
             "coverage_curve group_points mean_bias pull_summary serial_numbers trend_series"
         ),
+        "engine.calibration": "Calibration calibrate",
+        "engine.codes.compare": "Comparison compare_codes",
+        "engine.codes.coolest": "write_coolest",
         "engine.comparison": "compare",
         "engine.experiment": "inspect_simulation run",
         "engine.imaging.external": "observation_from_arrays",
@@ -166,9 +172,11 @@ __all__ = [
     "Analysis",
     "Aperture",
     "BiasPoint",
+    "Calibration",
     "Camera",
     "CameraChoice",
     "ChainSummary",
+    "Comparison",
     "Configuration",
     "CoverageCurve",
     "EngineError",
@@ -226,12 +234,14 @@ __all__ = [
     "accuracy_rows",
     "analyse",
     "bias_points",
+    "calibrate",
     "camera_from_mapping",
     "camera_names",
     "check_analysis",
     "check_realization",
     "check_system",
     "compare",
+    "compare_codes",
     "complaint",
     "configuration_of",
     "coverage_curve",
@@ -271,5 +281,6 @@ __all__ = [
     "system_from_mapping",
     "system_names",
     "trend_series",
+    "write_coolest",
     "write_observation",
 ]

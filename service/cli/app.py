@@ -14,6 +14,7 @@ from typer.exceptions import TyperException
 import service
 from service.cli import grids, pictures
 from service.cli.accuracy import accuracy
+from service.cli.codes import compare_codes
 from service.cli.connection import FailedError, console
 from service.cli.connection import settings as _settings
 from service.cli.figures import figures
@@ -67,7 +68,7 @@ app = typer.Typer(
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, accuracy, measure, replay):
+for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, accuracy, measure, compare_codes, replay):
     app.command()(command)
 
 

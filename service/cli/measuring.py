@@ -15,7 +15,7 @@ from service.cli.outputs import FITS, PICTURES, require_apart, require_file, req
 from service.cli.pictures import refusals
 
 if TYPE_CHECKING:
-    from engine import ImageMeasurement, Observation
+    from engine import Calibration, ImageMeasurement, Observation
 
 _DPI = 110
 _UNITS = ("e-/s", "e-", "count/s", "count", "DN/s", "DN", "MJy/sr")
@@ -63,6 +63,9 @@ def measure(
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the chain")] = 0,
     inversion: Annotated[bool, typer.Option(help="Sample the inversion too; without it seconds")] = True,
+    calibrations: Annotated[
+        int | None, typer.Option("--calibrate", help="Correct the answer by so many simulations like the image")
+    ] = None,
 ) -> None:
     """Measure the host galaxy in an image. Its magnitude, radius and index, with their uncertainties."""
     if no_agn and (agn_images or positions):
@@ -78,13 +81,13 @@ def measure(
     with refusals():
         from rich.console import Console  # noqa: PLC0415 - help needs none
 
-        observation = _observation(
+        observation = observation_of_files(
             image, psf, trust_options=trust_options, noise=noise, pixel_scale=pixel_scale, zero_point=zeropoint,
             mask=mask, dq=dq, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation,
             sky_rms_e_s=sky_rms, good_bits=good_bits, center=center, size=size, extension=extension,
             psf_oversampling=psf_oversampling,
         )  # fmt: skip
-        from engine import measure_image, readings  # noqa: PLC0415 - seconds, which only an image is worth
+        from engine import calibrate, measure_image, readings  # noqa: PLC0415 - seconds, which only an image is worth
 
         for reading in readings(observation):
             typer.echo(f"read.{reading.name:12s} {_short(reading.value)}  ({reading.origin})")
@@ -96,11 +99,16 @@ def measure(
                 inversion=inversion,
                 trust_options=trust_options, progress=lambda stage, _: status.update(_SAID.get(stage, "inversion")),
             )  # fmt: skip
-    for line in _summary(found):
+            calibration = None
+            if calibrations is not None:
+                calibration = calibrate(
+                    found, calibrations, seed, lambda _, done: status.update(f"simulations {done:.0%}")
+                )
+    for line in (*_summary(found), *([] if calibration is None else _corrected(calibration))):
         typer.echo(line)
     for warning in found.warnings:
         typer.echo(f"warning: {warning}", err=True)
-    failed = _write(found, json_file, figure, fits)
+    failed = _write(found, calibration, json_file, figure, fits)
     for path in outputs:
         typer.echo(f"{path}: not written ({failed[path]})" if path in failed else path, err=path in failed)
     if failed:
@@ -111,7 +119,7 @@ def _short(value: str | float) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _observation(image: Path, psf: Path | None, *, trust_options: bool, **how: Any) -> Observation:
+def observation_of_files(image: Path, psf: Path | None, *, trust_options: bool, **how: Any) -> Observation:
     """Our own FITS file as it is, or anybody's from its parts; ``how`` is None where nothing is given."""
     if psf is None:
         return _own_observation(image, [name for name, value in how.items() if value is not None])
@@ -161,7 +169,11 @@ def _positions(given: list[str] | None) -> list[tuple[float, float]] | None:
 
 
 def _write(
-    found: ImageMeasurement, json_file: Path | None, figure: Path | None, fits: Path | None
+    found: ImageMeasurement,
+    calibration: Calibration | None,
+    json_file: Path | None,
+    figure: Path | None,
+    fits: Path | None,
 ) -> dict[Path, Exception]:
     """Each file whole or not at all; those that could not be written, and why: none takes another with it."""
 
@@ -177,7 +189,8 @@ def _write(
         write_measurement(path, found)
 
     def tell(path: Path) -> None:
-        path.write_text(json.dumps(found.to_dict(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        told = found.to_dict() | ({} if calibration is None else {"calibration": calibration.to_dict()})
+        path.write_text(json.dumps(told, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
     failed: dict[Path, Exception] = {}
     for target, write in ((json_file, tell), (fits, store), (figure, draw)):
@@ -219,3 +232,13 @@ def _summary(found: ImageMeasurement) -> list[str]:
     if work.parameters_sampled:
         told += f", {work.parameters_sampled} parameters sampled by {work.evidence_evaluations:,} evidence evaluations"
     return [*lines, told]
+
+
+def _corrected(calibration: Calibration) -> list[str]:
+    lines = [
+        f"calibrated.{name:10s} {one.corrected.mean:8.3f} +- {one.corrected.sd:.3f}  "
+        f"(simulations: bias {one.bias:+.3f} +- {one.bias_error:.3f}, scatter {one.pull_sd:.2f} of the errors, "
+        f"{one.covered95} of {calibration.simulations} inside 95 %)"
+        for name, one in calibration.quantities.items()
+    ]
+    return lines + [f"not measured: {count} simulations: {why}" for why, count in calibration.failed.items()]
