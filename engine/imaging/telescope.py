@@ -85,11 +85,11 @@ def known_psf(camera: Camera, oversampling: int, coarse: int = 1) -> FloatArray:
     psf = optical_psf(camera, oversampling)
     if coarse == 1:
         return psf
-    # Means round the middle, and between them what the band allows: the star is put in their place by the same spline.
-    means = ndimage.uniform_filter(psf, coarse, mode="constant")
-    if coarse % 2 == 0:
-        # Its window has no middle element: half of the one behind, half of the one before.
-        means = 0.25 * sum(np.roll(means, (-j, -i), axis=(0, 1)) for j in (0, 1) for i in (0, 1))
+    # An even number of them has half of one at either end.
+    window = np.ones(coarse) if coarse % 2 else np.concatenate([[0.5], np.ones(coarse - 1), [0.5]])
+    means = psf
+    for axis in (0, 1):
+        means = ndimage.convolve1d(means, window / coarse, axis=axis, mode="constant")
     means = np.asarray(means * (psf.sum() / means.sum()))
     means.setflags(write=False)
     return means

@@ -25,6 +25,7 @@ from engine.parametric.galaxies import asks_for_galaxy, with_galaxy
 from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.parametric.model import ImageModel
 from engine.parametric.numerical_error import HostShift, host_shifts
+from engine.parametric.optics_error import BLUR_SD, COLOUR_SD, DEFOCUS_SD
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
@@ -42,6 +43,8 @@ GOOD_START = Acceptance()
 _N = COORDINATES.index("n")
 _DOUBTFUL = 1.5
 """chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
+_FAR = 0.2
+"""Deviations of its prior by which a state of the telescope has to move for a search to be begun anew."""
 _SEARCHES = 4
 """How often the optics may be learned and the search begun anew."""
 
@@ -187,7 +190,7 @@ def _searched(
             learned: Observation | None = None
             try:
                 reached = polished(task, solution)
-                if reached.model.observation.response is not task.observation.response:
+                if _is_elsewhere(task.observation.response, reached.model.observation.response):
                     learned = reached.model.observation
                 if task.dark_host and task.deflector and asks_for_galaxy(reached):
                     reached = with_galaxy(task, reached, theta_E, agn_told=agn_told)
@@ -205,6 +208,19 @@ def _searched(
             if learned is not None:
                 return best, learned
     return best, None
+
+
+def _is_elsewhere(one: ExposedOptics | None, other: ExposedOptics | None) -> bool:
+    """Whether optics have moved so far that a search with the others may end elsewhere."""
+    if one is None or other is None or one is other:
+        return False
+    here, there = one.state, other.state
+    moved = (
+        abs(there.defocus_nm - here.defocus_nm) / DEFOCUS_SD,
+        abs(there.blur - here.blur) / BLUR_SD,
+        abs(there.colour - here.colour) / COLOUR_SD,
+    )
+    return max(moved) > _FAR or (one.correction is None and other.correction is not None)
 
 
 def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> ParametricFit:

@@ -42,10 +42,10 @@ _SMOOTHED = 0.6
 
 @dataclass(frozen=True, eq=False)
 class LearnedOptics:
-    """A state of the telescope, ln of the evidence for it, and the columns of what it leaves open."""
+    """A state of the telescope, what it lowers chi^2 by, and the columns of what it leaves open."""
 
     state: TelescopeState
-    gain: float
+    explained: float
     shared: SharedError
 
 
@@ -63,16 +63,16 @@ def learned_optics(solution: Solution) -> LearnedOptics | None:
     if not _asks(seen, solution):
         # A search begun anew has a state that is right, but does not yet marginalise it.
         anew = response.state != NOMINAL_STATE and solution.model.shared is None
-        return search.learned(response.state, _GAIN) if anew else None
+        return search.learned(response.state, 0.0) if anew else None
     found = search.nearest(response.state)
     # On the other side of focus the PSF is much the same.
     mirrored = replace(found, defocus_nm=-found.defocus_nm)
     if search.cost(mirrored) < search.cost(found):
         found = search.nearest(mirrored)
-    gain = 0.5 * (search.cost(response.state) - search.cost(found)) / seen.excess(search.derivatives(found))
-    if gain < _GAIN:
+    explained = search.cost(response.state) - search.cost(found)
+    if 0.5 * explained / seen.excess(search.derivatives(found)) < _GAIN:
         return None
-    return search.learned(found, gain)
+    return search.learned(found, explained)
 
 
 def stamp_is_wrong(solution: Solution) -> bool:
@@ -181,10 +181,10 @@ class _Search:
         """Whitened columns (pixels, 3) of the derivatives by defocus, blur and colour."""
         return self._seen.laid(self._changes(state)[[0, 2, 3]])
 
-    def learned(self, state: TelescopeState, gain: float) -> LearnedOptics:
+    def learned(self, state: TelescopeState, explained: float) -> LearnedOptics:
         """A state with the columns of its prior, of whose amplitudes the fit has none yet."""
         columns = self._seen.unwhitened(self.derivatives(state)) * _SD
-        return LearnedOptics(state, gain, SharedError(columns, np.zeros(_SD.size), 0))
+        return LearnedOptics(state, explained, SharedError(columns, np.zeros(_SD.size), 0))
 
     def nearest(self, state: TelescopeState) -> TelescopeState:
         """The minimum that steps from a state lead to."""

@@ -32,6 +32,8 @@ _DOUBTFUL = 1.5
 """Chi^2 per pixel from which on the optics are asked before a fit is made exact."""
 _MISLED = 20.0
 """Chi^2 per pixel from which on a fit by a wrong PSF has led elsewhere, so that another would end there too."""
+_TELLING = 0.3
+"""Part of such a chi^2 that the PSF must explain."""
 _ROUNDS = 3
 """Fits with errors of the model: each learns from the one before."""
 _ASKED = 4.0
@@ -117,10 +119,14 @@ def _with_state_learned(task: Task, solution: Solution) -> Solution:
         found, response = learned_optics(solution), task.observation.response
         if found is None or response is None:
             break
+        misled = solution.cost > _MISLED * solution.model.pixels
+        if misled and found.explained < _TELLING * solution.cost:
+            # A false minimum, whatever the PSF: another start is wanted.
+            break
         other, psf = response.in_state(found.state), task.observation.psf
         psf = psf + response.stamp_change(other, psf.shape[0] // 2)
         task = replace(task, observation=replace(task.observation, psf=psf, response=other))
-        if solution.cost > _MISLED * solution.model.pixels:
+        if misled:
             # Nothing but the state of the telescope is worth keeping of it: a search begins anew from there.
             return full_fit(task, solution, fitted_sigma(task, solution), shear=solution.space.shear, steps=1)
         solution = _exactly(_refitted(task, solution, found.shared))
