@@ -120,6 +120,13 @@ class Expansion:
             for optics, replicate in product(self._optics, range(self._grid.replicates)):
                 yield self._run(point, replicate, optics)
 
+    def by_replicate(self) -> Iterator[GridRun]:
+        """The same runs in another order: the first replicate of each point, then the second of each, and so on."""
+        for replicate in range(self._grid.replicates):
+            for point in _free_points(self._grid) if self._paper is None else self._paper:
+                for optics in self._optics:
+                    yield self._run(point, replicate, optics)
+
     def _run(self, point: _Point, replicate: int, optics: Optics | None) -> GridRun:
         (system, number, host, l_eta), grid = point, self._grid
         realization = Realization(

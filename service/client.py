@@ -90,8 +90,9 @@ class Client:
     def submit(self, request: Mapping[str, Any] | None = None, /, *, key: str | None = None, **fields: Any) -> GridView:
         """Submit a grid: the body of POST /v1/grids as a mapping, as keywords, or both, of which keywords count.
 
-        With ``key`` a repetition gives back the grid of the first time, and a request that fails on its way is
-        repeated.
+        ``until={"quantity": "magnitude", "error": 0.01, "at_most": 100}`` in the place of ``replicates`` ends the
+        realizations of each point once its mean bias is known so well. With ``key`` a repetition gives back the grid
+        of the first time, and a request that fails on its way is repeated.
         """
         headers = {"Content-Type": "application/json"}
         if key is not None:

@@ -71,7 +71,8 @@ def submit(
     if dry_run:
         runs = plan(body, service.settings.max_grid_runs)
         labels = [run.label for run in islice(runs, _SHOWN_LABELS)]
-        found = DryRun(n_runs=len(runs), labels=labels, cost=service.costs.cost(runs.kinds()))
+        cost = service.costs.cost(runs.kinds())
+        found = DryRun(n_runs=len(runs), least_runs=runs.least, labels=labels, cost=cost)
         return JSONResponse(found.model_dump(mode="json"))
     planned = cache(lambda: plan(body, service.settings.max_grid_runs))
     made = service.grids.create(
@@ -82,6 +83,7 @@ def submit(
         engine_digest(),
         caller.name,
         lambda: service.costs.expected_wall_s(planned().kinds()),
+        body.until,
     )
     return accepted(made, link_grid(made.grid))
 

@@ -87,10 +87,13 @@ def runs_table(runs: Iterable[RunView]) -> Table:
 def grid_line(grid: GridView) -> str:
     """One line on how far a grid is."""
     parts = [f"{grid.id} {grid.state}: {grid.counts.done}/{grid.n_runs} stored"]
-    for state in ("leased", "paused", "failed", "quarantined", "cancelled"):
+    for state in ("leased", "paused", "failed", "quarantined", "cancelled", "not_needed"):
         number = getattr(grid.counts, state)
         if number:
-            parts.append(f"{number} {'running' if state == 'leased' else state}")
+            parts.append(f"{number} {'running' if state == 'leased' else state.replace('_', ' ')}")
+    if grid.until is not None:
+        until = grid.until
+        parts.append(f"{until.reached} of {until.points} points known to {until.error:g} in {until.quantity}")
     if grid.rate_per_s:
         parts.append(f"{60 * grid.rate_per_s:.2g} runs/min")
     if grid.eta_seconds and grid.finished_at is None:
@@ -102,8 +105,9 @@ def dry_run_lines(found: DryRun) -> list[str]:
     """What a request would start, the first runs by name."""
     shown = found.labels[:_SHOWN_LABELS]
     more = found.n_runs - len(shown)
+    least = "" if found.least_runs == found.n_runs else f"{found.least_runs} to "
     return [
-        f"{found.n_runs} run{'' if found.n_runs == 1 else 's'}",
+        f"{least}{found.n_runs} run{'' if found.n_runs == 1 else 's'}",
         *shown,
         *([f"... and {more} more"] if more else []),
         *_cost_lines(found.cost),

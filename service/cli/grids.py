@@ -27,7 +27,9 @@ Where = Annotated[
     list[str] | None,
     typer.Option(metavar="AXIS=VALUE", help="As system=HE0435 or magnitude=20..22; may be repeated"),
 ]
-_WATCH = typer.Option("--wait", "--watch", help="Stay until the grid has ended; exit code 1 unless all runs are stored")
+_WATCH = typer.Option(
+    "--wait", "--watch", help="Stay until the grid has ended; exit code 1 unless all runs that are needed are stored"
+)
 Watch = Annotated[bool, _WATCH]
 
 
@@ -57,6 +59,13 @@ def submit(
     l_eta: Floats = None,
     seed: Annotated[int | None, typer.Option(help="Of the first replicate; 0 without")] = None,
     replicates: Annotated[int | None, typer.Option(help="Seeds of each point; 1 without")] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(metavar="QUANTITY=ERROR", help="Seeds until its mean bias is known so well, as magnitude=0.02"),
+    ] = None,
+    until_estimator: Annotated[str | None, typer.Option(help="By which; the recommended one without")] = None,
+    at_least: Annotated[int | None, typer.Option(help="Seeds of each point, with --until; 10 without")] = None,
+    at_most: Annotated[int | None, typer.Option(help="The same; 100 without")] = None,
     camera: Annotated[str | None, typer.Option(help="Instead of the systems': a name, or a TOML or JSON file")] = None,
     mass_model: Annotated[str | None, typer.Option(help="recommended without, or another of the systems")] = None,
     noise_level: Annotated[str | None, typer.Option(help="author without (the paper's scripts), or handbook")] = None,
@@ -98,6 +107,8 @@ def submit(
         "mass_model": mass_model, "noise_level": noise_level, "name": name,
     }  # fmt: skip
     request |= {option: value for option, value in options.items() if value not in (None, [])}
+    rule = {"estimator": until_estimator, "at_least": at_least, "at_most": at_most}
+    _change(request, "until", {**_error_of(until), **rule})
     _spoil(
         request, defocus_nm=defocus_nm, jitter=jitter, colour=colour, residual=residual, residual_seed=residual_seed,
         coarse=coarse,
@@ -249,7 +260,7 @@ def _watch(client: Client, grid_id: str) -> None:
     with progress(console()) as show:
         grid = client.wait(grid_id, show)
     _tell(grid)
-    if grid.counts.done != grid.n_runs:
+    if grid.counts.done + grid.counts.not_needed != grid.n_runs:
         raise typer.Exit(1)
 
 
@@ -312,6 +323,17 @@ def _fields(analysis: list[str] | None) -> dict[str, Any]:
         except (ValueError, RecursionError):
             found[name] = value
     return found
+
+
+def _error_of(until: str | None) -> dict[str, Any]:
+    """Quantity and error of QUANTITY=ERROR."""
+    if until is None:
+        return {}
+    quantity, error = _pair("--until", until)
+    try:
+        return {"quantity": quantity, "error": float(error)}
+    except ValueError:
+        raise typer.BadParameter(f"--until: got {until!r}, allowed is QUANTITY=ERROR, as magnitude=0.02") from None
 
 
 def _pair(option: str, text: str) -> tuple[str, str]:

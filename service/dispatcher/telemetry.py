@@ -206,3 +206,7 @@ class MeasuredQueue(RunQueue):
         """As the queue's."""
         self._metrics.refusals.labels("ending").inc(runs)
         self._metrics.ended.labels(RunState.QUARANTINED).inc(runs)
+
+    def note_spared(self, runs: int) -> None:
+        """As the queue's."""
+        self._metrics.ended.labels(RunState.NOT_NEEDED).inc(runs)

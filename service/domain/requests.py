@@ -46,6 +46,7 @@ from engine import (
     system_names,
 )
 from service.domain.plan import OPTICS_AXES, Kind, PlannedRun
+from service.domain.precision import Until
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
 
 CONFIGURATIONS = {2: "double", 4: "quad"}
@@ -73,8 +74,9 @@ class GridRequest(BaseModel):
 
     With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
     lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
-    so is ``camera``, which takes the place of the systems' own. ``optics``, one or a list of them, spoil the
-    PSF of the sky; each point is run with each. ``replicates`` repeats each point with seeds seed, seed + 1, ...
+    so is ``camera``, which takes the place of the systems' own. ``optics``, one or a list of them, spoil the PSF of the
+    sky; each point is run with each. ``replicates`` repeats each point with seeds seed, seed + 1, ...; with ``until``
+    instead each point is repeated until its mean bias is known to an error.
     """
 
     model_config = _CONFIG
@@ -92,7 +94,13 @@ class GridRequest(BaseModel):
     camera: CameraChoice | None = None
     seed: FirstSeed = 0
     replicates: Replicates = 1
+    until: Until | None = None
     analysis: AnalysisBody | None = None
+
+    @property
+    def most_replicates(self) -> int:
+        """Seeds that a point has at most."""
+        return self.replicates if self.until is None else self.until.at_most
 
     def canonical(self) -> dict[str, Any]:
         """What was asked for, without what was left out: kept with the grid and compared under an idempotency key."""
@@ -107,10 +115,14 @@ class TooManyRunsError(ValueError):
 
 
 class Plan:
-    """The runs that a request means, in the engine's order: counted at once, made one by one as they are stored."""
+    """The runs that a request means: counted at once, made one by one as they are stored.
 
-    def __init__(self, runs: Expansion) -> None:
+    In the engine's order; where replicates may turn out not to be needed, the first of each point come first.
+    """
+
+    def __init__(self, runs: Expansion, until: Until | None = None) -> None:
         self._runs = runs
+        self._until = until
 
     def __len__(self) -> int:
         """How many runs there are."""
@@ -118,7 +130,13 @@ class Plan:
 
     def __iter__(self) -> Iterator[PlannedRun]:
         """Make the runs, anew each time."""
-        return map(_planned, self._runs)
+        return map(_planned, self._runs if self._until is None else self._runs.by_replicate())
+
+    @property
+    def least(self) -> int:
+        """How many of them have to be done: all, or those that each point has before it is judged."""
+        until = self._until
+        return len(self) if until is None else len(self) // until.at_most * until.at_least
 
     def kinds(self) -> dict[Kind, int]:
         """How many runs there are of each kind."""
@@ -138,17 +156,35 @@ def plan(request: GridRequest, max_runs: int) -> Plan:
     TooManyRunsError
         There would be more than ``max_runs``.
     """
+    _require_fitting(request)
     # Before anything is looked at: a few lists can mean more systems and slopes than there is time for.
     lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
     if request.preset is None:
         each = len(request.optics) if isinstance(request.optics, tuple) else 1
-        _limit(math.prod(len(values or ()) for values in lists) * each * request.replicates, max_runs)
+        _limit(math.prod(len(values or ()) for values in lists) * each * request.most_replicates, max_runs)
     _check_own_systems(request)
     runs = Expansion(_grid(request))
     _limit(len(runs), max_runs)
     for run in runs.samples:
         _check(request, run.realization)
-    return Plan(runs)
+    return Plan(runs, request.until)
+
+
+def _require_fitting(request: GridRequest) -> None:
+    """Refuse a rule that cannot end replicates, or that something else in the request contradicts."""
+    until = request.until
+    if until is None:
+        return
+    if "replicates" in request.model_fields_set:
+        raise SpecError("replicates", request.replicates, "nothing beside until, whose at_most says how many at most")
+    if until.at_least > until.at_most:
+        raise SpecError("until.at_least", until.at_least, f"at most at_most, which is {until.at_most}")
+    given = None if request.analysis is None else getattr(request.analysis, "estimators")  # noqa: B009 - made by name
+    computed = given or Analysis().estimators
+    if until.estimator not in computed:
+        raise SpecError("until.estimator", until.estimator, f"one that the analysis computes: {', '.join(computed)}")
+    if (until.quantity, until.index_prior) == ("n", "fixed"):
+        raise SpecError("until.index_prior", "fixed", "wide or free, since n has no bias where it is fixed")
 
 
 def _check_own_systems(request: GridRequest) -> None:
@@ -199,7 +235,7 @@ def _grid(request: GridRequest) -> Grid:
         optics=request.optics,
         camera=request.camera,
         seed=request.seed,
-        replicates=request.replicates,
+        replicates=request.most_replicates,
         analysis=Analysis(**changes),
         **cuts,
     )

@@ -16,6 +16,8 @@ class RunState(StrEnum):
     FAILED = "failed"
     QUARANTINED = "quarantined"
     CANCELLED = "cancelled"
+    NOT_NEEDED = "not_needed"
+    """Its point's mean bias is known well enough without it."""
 
 
 class GridState(StrEnum):
@@ -58,6 +60,7 @@ PAUSE = _from(RunState.QUEUED, to=RunState.PAUSED)
 RESUME = _from(RunState.PAUSED, to=RunState.QUEUED)
 CANCEL = _from(RunState.QUEUED, RunState.PAUSED, to=RunState.CANCELLED)
 CANCEL_RUNNING = _from(RunState.LEASED, to=RunState.CANCELLED)
+SPARE = _from(RunState.QUEUED, RunState.PAUSED, to=RunState.NOT_NEEDED)
 REVIVE = _from(RunState.FAILED, RunState.QUARANTINED, RunState.CANCELLED, to=RunState.QUEUED)
 
 TRANSITIONS = {
@@ -70,5 +73,6 @@ TRANSITIONS = {
     "resume": RESUME,
     "cancel": CANCEL,
     "cancel_running": CANCEL_RUNNING,
+    "spare": SPARE,
     "revive": REVIVE,
 }

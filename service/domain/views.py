@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.domain.payload import ChainPayload, EstimateName, StagePayload, WorkPayload
+from service.domain.precision import Until
 from service.domain.states import GridState, RunState
 
 UwsPhase = Literal["PENDING", "QUEUED", "HELD", "EXECUTING", "COMPLETED", "ERROR", "ABORTED"]
@@ -20,6 +21,7 @@ UWS_PHASES: dict[str, UwsPhase] = {
     "failed": "ERROR",
     "quarantined": "ERROR",
     "cancelled": "ABORTED",
+    "not_needed": "ABORTED",
 }
 """States in the words of the IVOA's Universal Worker Service."""
 
@@ -64,11 +66,23 @@ class RunCounts(_Answer):
     failed: int = 0
     quarantined: int = 0
     cancelled: int = 0
+    not_needed: int = 0
+    """Replicates that nobody runs, since the mean bias of their point is known well enough without them."""
 
     @property
     def ended(self) -> int:
         """Runs that will not change by themselves."""
-        return self.done + self.failed + self.quarantined + self.cancelled
+        return self.done + self.failed + self.quarantined + self.cancelled + self.not_needed
+
+
+class UntilView(Until):
+    """The rule that ends replicates of a grid, and how many of its points it has ended."""
+
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+
+    points: int
+    reached: int
+    """Points whose mean bias is known to ``error``: of the others replicates go on, or all have ended."""
 
 
 class GridView(_Answer):
@@ -80,13 +94,15 @@ class GridView(_Answer):
     uws_phase: UwsPhase
     n_runs: int
     counts: RunCounts
+    until: UntilView | None
+    """Null where all replicates are wanted."""
     progress: float
     """Share of the runs that have ended."""
     rate_per_s: float | None
     """Runs that ended per second, over the latest hundred; None before the first."""
     eta_seconds: float | None
     """Time left by the rate; before the first run has ended, by stored runs of its kind on the workers of now, and null
-    where there are none."""
+    where there are none. With ``until``, of so many replicates as it should take by the scatter of those there are."""
     created_at: datetime
     finished_at: datetime | None
     cancelled_at: datetime | None
@@ -175,6 +191,9 @@ class DryRun(_Answer):
     """What a request would start, and what that would cost."""
 
     n_runs: int
+    """With ``until``, at most; so is the cost."""
+    least_runs: int
+    """``n_runs``; with ``until``, those without which no point is judged."""
     labels: list[str]
     """Labels of the first hundred runs."""
     cost: Cost
@@ -458,11 +477,26 @@ class SummaryEstimate(_Answer):
     failed: int
 
 
+class PrecisionView(_Answer):
+    """How well the mean bias of a point is known that a grid wants to know ``until`` an error."""
+
+    reached: bool
+    """Whether it was known well enough at some time; what was running then has been added since."""
+    runs: int
+    """Replicates with an answer of the rule's estimator."""
+    standard_error: float | None
+    """Of their mean bias; null of fewer than two."""
+    upper_limit: float | None
+    """Of that at 84.1 %, which is what is compared with ``until.error``; null of fewer than three."""
+
+
 class SummaryRow(_Answer):
     """The runs that share an input (they differ in their seed)."""
 
     input: dict[str, Any]
     n_runs: int
+    precision: PrecisionView | None
+    """Null where the grid wants all replicates."""
     estimates: dict[EstimateName, SummaryEstimate | None]
 
 

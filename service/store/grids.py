@@ -24,6 +24,7 @@ from sqlalchemy.exc import IntegrityError
 
 from service.domain.identifiers import utc_now
 from service.domain.plan import Plan
+from service.domain.precision import Until
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState
 from service.domain.views import GridKind, GridPage, GridView
 from service.store.database import Database
@@ -31,6 +32,7 @@ from service.store.leadership import leader_view
 from service.store.leases import add_event, lock_grids
 from service.store.pace import recent, recent_of
 from service.store.pieces import PIECE, Turns
+from service.store.points import progress
 from service.store.rows import (
     ended_grid_view,
     grid_view,
@@ -91,6 +93,7 @@ class GridStore(RunStore):
         engine: str | None = None,
         owner: str | None = None,
         expected_wall_s: Callable[[], float | None] = lambda: None,
+        until: Until | None = None,
     ) -> Created:
         """Store a grid with all its runs, or give back the one that the same key made.
 
@@ -98,7 +101,8 @@ class GridStore(RunStore):
         with where the key comes again, else taken away. ``plan`` is called only where there is something to create.
         ``engine`` is the digest of the engine whose results the grid takes, any where None; a key is its
         ``owner``'s: of another one it is another request. ``expected_wall_s`` is what its runs should take on one
-        worker, asked as ``plan`` is.
+        worker, asked as ``plan`` is. ``until`` ends replicates: the plan has ``at_most`` of each point, the first
+        of all points before the second of any.
 
         Raises
         ------
@@ -118,7 +122,7 @@ class GridStore(RunStore):
             with self._database.write() as connection:
                 give_up(connection, known.id, self._clock())
             known = None
-        new = Submission(request, canonical, name, key, engine, self._clock(), owner)
+        new = Submission(request, canonical, name, key, engine, self._clock(), owner, until=until)
         if known is None:
             new = replace(new, expected_wall_s=expected_wall_s())
             try:
@@ -297,7 +301,8 @@ class GridStore(RunStore):
         counts = {str(state): row._mapping[f"{state}_runs"] for state in RunState}
         latest = recent_of(connection, grid_id)
         workers = _workers(connection) if latest is None and row.expected_wall_s is not None else 0
-        return grid_view(row, counts, latest, self._clock(), workers)
+        far = progress(connection, _with_rule([row])).get(row.id)
+        return grid_view(row, counts, latest, self._clock(), workers, far)
 
     def _views(self, connection: Connection, rows: Sequence[Row[Any]]) -> list[GridView]:
         now = self._clock()
@@ -308,12 +313,18 @@ class GridStore(RunStore):
             counts[row.grid_id][row.state] = row.runs
         latest = recent(connection, ids) if ids else {}
         workers = _workers(connection) if len(latest) < len(ids) else 0
+        far = progress(connection, _with_rule([row for row in rows if row.ending is None]))
         return [
-            grid_view(row, counts[row.id], latest.get(row.id), now, workers)
+            grid_view(row, counts[row.id], latest.get(row.id), now, workers, far.get(row.id))
             if row.ending is None
             else ended_grid_view(row)
             for row in rows
         ]
+
+
+def _with_rule(rows: Sequence[Row[Any]]) -> dict[str, tuple[int, int]]:
+    """Points and most replicates of those grids that end replicates."""
+    return {row.id: (row.points, row.until["at_most"]) for row in rows if row.until is not None}
 
 
 def _workers(connection: Connection) -> int:

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 from sqlalchemy import ColumnElement, Connection, Row, exists, func, literal_column, select, update
 
-from service.domain.states import CANCEL, OPEN_STATES, PAUSE, QUARANTINE, REQUEUE, GridState, RunState
+from service.domain.states import CANCEL, OPEN_STATES, PAUSE, QUARANTINE, REQUEUE, SPARE, GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.faults import AWAY
 from service.store.pace import recent
-from service.store.tables import attempt, event, grid, run
+from service.store.tables import attempt, event, grid, point, run
 from service.store.transitions import move
 
 _LOG = logging.getLogger(__name__)
@@ -151,7 +151,7 @@ def end_attempts(
 
 
 class Requeued(NamedTuple):
-    """Ids of the runs that went back and were not cancelled, and of those that had to be set aside."""
+    """Ids of the runs that went back and are still wanted, and of those that had to be set aside."""
 
     given: list[str]
     refused: list[str]
@@ -168,6 +168,7 @@ def requeue(
 ) -> Requeued:
     """Give leased runs back to the queue, or cancel or pause those whose grid was cancelled or paused meanwhile.
 
+    One whose point was reached meanwhile is not needed any more.
     Without ``not_before`` they keep their place at the head of the queue; as a ``suspect`` they wait in a lane of
     their own. One that the database refuses keeps no other from going back: it is set aside.
     """
@@ -212,6 +213,7 @@ def _requeue(
     )
     cancelled_grids = select(grid.c.id).where(grid.c.cancelled_at.is_not(None))
     dropped = set(move(connection, CANCEL, run.c.id.in_(ids), run.c.grid_id.in_(cancelled_grids), finished_at=now))
+    dropped.update(spare_queued(connection, run.c.id.in_(ids), now))
     if dropped:
         close_grids(connection, {row.grid_id for row in rows}, now)
     pause_queued(connection, run.c.id.in_(ids))
@@ -251,6 +253,14 @@ def pause_queued(connection: Connection, where: ColumnElement[bool]) -> list[str
     return move(connection, PAUSE, where, run.c.grid_id.in_(paused_grids))
 
 
+def spare_queued(connection: Connection, where: ColumnElement[bool], now: datetime) -> list[str]:
+    """Take waiting runs of points that were reached out of the queue; the caller holds the grids' locks."""
+    points = select(grid.c.points).where(grid.c.id == run.c.grid_id).correlate(run).scalar_subquery()
+    mine = (point.c.grid_id == run.c.grid_id) & (point.c.place == run.c.ordinal % points)
+    reached = exists().where(mine, point.c.reached_at.is_not(None)).correlate(run)
+    return move(connection, SPARE, where, reached, finished_at=now)
+
+
 def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) -> None:
     """Store the final state of each grid whose last run has just ended; the caller holds the grids' locks."""
     for grid_id in sorted(set(grid_ids)):
@@ -262,7 +272,8 @@ def close_grids(connection: Connection, grid_ids: Iterable[str], now: datetime) 
         counted = select(run.c.state, func.count().label("runs")).where(mine).group_by(run.c.state)
         runs = {row.state: row.runs for row in connection.execute(counted)}
         state, latest = final_state(runs), recent(connection, [grid_id]).get(grid_id)
-        ending = {"counts": runs, "rate_per_s": latest and latest.rate()}
+        reached = connection.scalar(select(func.count(point.c.reached_at)).where(point.c.grid_id == grid_id))
+        ending = {"counts": runs, "rate_per_s": latest and latest.rate(), "reached": reached}
         values = {"state": state, "finished_at": now, "paused_at": None, "ending": ending}
         connection.execute(update(grid).where(grid.c.id == grid_id).values(**values))
         add_event(connection, grid_id, "grid_finished", now, state=state, runs=runs)

@@ -49,6 +49,7 @@ from service.store.leases import (
     requeue,
     set_aside,
 )
+from service.store.points import Replicate, judge_points
 from service.store.results import estimate_rows, measurement_row, result_row
 from service.store.settling import held_grids
 from service.store.sums import add_to_inputs, add_to_moments
@@ -199,8 +200,8 @@ class RunQueue:
                 for (lease, payload), is_valid in zip(results, stored, strict=True)
             ]
 
-    @staticmethod
     def _finish(
+        self,
         connection: Connection,
         rows: Sequence[LeasedRow],
         results: Sequence[tuple[Lease, Payload]],
@@ -212,7 +213,7 @@ class RunQueue:
         move(connection, FINISH, run.c.id.in_(ids), finished_at=now, error_code=None, error_detail=None)
         found = [(lease, payload) for lease, payload in results if isinstance(payload, ResultPayload)]
         if found:
-            _insert_results(connection, found, now)
+            self.note_spared(_insert_results(connection, found, now))
         measured = [(lease, payload) for lease, payload in results if isinstance(payload, MeasurementPayload)]
         if measured:
             insert_rows(connection, measurement, [measurement_row(*one, now) for one in measured])
@@ -294,6 +295,9 @@ class RunQueue:
 
     def note_refused(self, runs: int) -> None:
         """So many runs could not go back to the queue and were set aside; for who counts them."""
+
+    def note_spared(self, runs: int) -> None:
+        """So many runs wait no more, since results made them superfluous; for who counts them."""
 
     def set_aside(self, lease: Lease, reason: Exception) -> bool:
         """Quarantine a run whose end the database refuses for what it is; whether the lease was still valid."""
@@ -420,12 +424,12 @@ _CLAIMED = (
 )
 
 
-def _insert_results(connection: Connection, results: Sequence[tuple[Lease, ResultPayload]], now: datetime) -> None:
-    """Write results of realizations with all that is added up from them."""
+def _insert_results(connection: Connection, results: Sequence[tuple[Lease, ResultPayload]], now: datetime) -> int:
+    """Write results of realizations with all that is added up from them; how many others are not needed any more."""
     ids = [lease.run_id for lease, _ in results]
-    asked = connection.execute(select(run.c.id, run.c.inputs).where(run.c.id.in_(ids)))
-    inputs = {row.id: row.inputs for row in asked}
-    stored = [result_row(lease, inputs[lease.run_id], payload, now) for lease, payload in results]
+    asked = connection.execute(select(run.c.id, run.c.ordinal, run.c.inputs).where(run.c.id.in_(ids)))
+    runs = {row.id: row for row in asked}
+    stored = [result_row(lease, runs[lease.run_id].inputs, payload, now) for lease, payload in results]
     for row, input_id in zip(stored, add_to_inputs(connection, stored), strict=True):
         row["input_id"] = input_id
     answers = [
@@ -437,6 +441,8 @@ def _insert_results(connection: Connection, results: Sequence[tuple[Lease, Resul
     if answers:
         insert_rows(connection, estimate, answers)
     add_to_moments(connection, stored, answers)
+    replicates = [Replicate(row["grid_id"], runs[row["run_id"]].ordinal, row["input_id"]) for row in stored]
+    return judge_points(connection, replicates, now)
 
 
 def _read_spec(text: str) -> dict[str, Any] | None:

@@ -20,8 +20,19 @@ from service.domain.payload import (
     estimator_and_prior,
 )
 from service.domain.states import GridState, RunState
-from service.domain.views import UWS_PHASES, AttemptView, GridView, ResultView, RunCounts, RunError, RunItem, RunView
+from service.domain.views import (
+    UWS_PHASES,
+    AttemptView,
+    GridView,
+    ResultView,
+    RunCounts,
+    RunError,
+    RunItem,
+    RunView,
+    UntilView,
+)
 from service.store.pace import Recent
+from service.store.points import Progress
 from service.store.tables import attempt, estimate, run
 
 RUN_COLUMNS = tuple(
@@ -52,15 +63,28 @@ _PLAIN = tuple(name for name in ResultView.model_fields if name not in _GATHERED
 
 def ended_grid_view(row: Row[Any]) -> GridView:
     """A grid none of whose runs is open, from what was written down at its end."""
-    return _grid_view(row, RunCounts(**row.ending["counts"]), GridState(row.state), row.ending["rate_per_s"], 0.0)
+    ending = row.ending
+    until = until_view(row, ending.get("reached", 0))
+    return _grid_view(row, RunCounts(**ending["counts"]), GridState(row.state), until, ending["rate_per_s"], 0.0)
+
+
+def until_view(row: Row[Any], reached: int) -> UntilView | None:
+    """The rule of a grid, and how many of its points it has ended; None where it has none."""
+    return None if row.until is None else UntilView(**row.until, points=row.points, reached=reached)
 
 
 def grid_view(
-    row: Row[Any], counts: dict[str, int], recent: Recent | None, now: datetime, workers: int = 0
+    row: Row[Any],
+    counts: dict[str, int],
+    recent: Recent | None,
+    now: datetime,
+    workers: int = 0,
+    progress: Progress | None = None,
 ) -> GridView:
     """A grid with its progress; an unfinished one that is not paused is running once a run has been started.
 
     ``workers`` that there are now: before the first run has ended the time left is that of stored runs of its kind.
+    ``progress`` of its points, where it has a rule that ends replicates.
     """
     runs = RunCounts(**counts)
     state = GridState(row.state)
@@ -69,15 +93,26 @@ def grid_view(
     elif state is GridState.QUEUED and (runs.leased or runs.ended):
         state = GridState.RUNNING
     remaining = runs.queued + runs.paused + runs.leased
+    if progress is not None:
+        # What the rule should let come, and what is running at least.
+        remaining = min(remaining, max(progress.left, runs.leased))
     rate, left = _pace(recent, remaining, now)
     if left is None and workers and row.expected_wall_s is not None:
-        left = row.expected_wall_s * remaining / row.n_runs / min(workers, remaining)
+        left = row.expected_wall_s * remaining / row.n_runs / max(min(workers, remaining), 1)
     if state is GridState.PAUSED:
         left = None
-    return _grid_view(row, runs, state, rate, left)
+    until = until_view(row, 0 if progress is None else progress.reached)
+    return _grid_view(row, runs, state, until, rate, left)
 
 
-def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | None, left: float | None) -> GridView:
+def _grid_view(
+    row: Row[Any],
+    runs: RunCounts,
+    state: GridState,
+    until: UntilView | None,
+    rate: float | None,
+    left: float | None,
+) -> GridView:
     return GridView(
         id=row.id,
         name=row.name,
@@ -85,6 +120,7 @@ def _grid_view(row: Row[Any], runs: RunCounts, state: GridState, rate: float | N
         uws_phase=UWS_PHASES[state],
         n_runs=row.n_runs,
         counts=runs,
+        until=until,
         progress=runs.ended / row.n_runs,
         rate_per_s=rate,
         eta_seconds=left,

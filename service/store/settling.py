@@ -13,7 +13,7 @@ from datetime import datetime
 from sqlalchemy import ColumnElement, Connection, Select, exists, literal_column, select, true, update
 
 from service.domain.states import CANCEL, PAUSE, RESUME, REVIVE, GridState, RunState, Transition
-from service.store.leases import close_grids
+from service.store.leases import close_grids, spare_queued
 from service.store.pieces import PIECE, places
 from service.store.tables import grid, run
 from service.store.transitions import move
@@ -60,9 +60,14 @@ def _wanted(cancelled_at: datetime | None, paused_at: datetime | None) -> Transi
 
 
 def revive_runs(connection: Connection, where: ColumnElement[bool], now: datetime) -> list[str]:
-    """Queue runs again that ended without a result, as if they had not been tried; the caller holds the grid's lock."""
+    """Queue runs again that ended without a result, as if they had not been tried; the caller holds the grid's lock.
+
+    Those whose point has been reached since are not needed any more.
+    """
     fresh = {"not_before": now, "charged_from": run.c.attempt, "finished_at": None, "suspect": False}
-    return move(connection, REVIVE, where, error_code=None, error_detail=None, **fresh)
+    revived = move(connection, REVIVE, where, error_code=None, error_detail=None, **fresh)
+    spare_queued(connection, where, now)
+    return revived
 
 
 def _move(connection: Connection, grid_id: str, transition: Transition, now: datetime) -> bool:

@@ -17,6 +17,7 @@ from sqlalchemy import Connection, Select, delete, func, insert, select, true, u
 
 from service.domain.identifiers import new_grid_id, run_id
 from service.domain.plan import Plan, PlannedRun
+from service.domain.precision import Until
 from service.domain.states import GridState, RunState
 from service.store.bulk import insert_rows
 from service.store.database import Database
@@ -42,6 +43,7 @@ class Submission:
     created_at: datetime
     owner: str | None = None
     expected_wall_s: float | None = None
+    until: Until | None = None
 
 
 def store(database: Database, submission: Submission, plan: Plan, begun: str | None = None) -> str:
@@ -88,6 +90,7 @@ def store(database: Database, submission: Submission, plan: Plan, begun: str | N
 
 
 def _begin(connection: Connection, grid_id: str, submission: Submission, n_runs: int) -> None:
+    until = submission.until
     connection.execute(
         insert(grid).values(
             id=grid_id,
@@ -99,6 +102,8 @@ def _begin(connection: Connection, grid_id: str, submission: Submission, n_runs:
             engine_digest=submission.engine,
             owner=submission.owner,
             expected_wall_s=submission.expected_wall_s,
+            until=None if until is None else until.model_dump(),
+            points=None if until is None else n_runs // until.at_most,
             storing=True,
         )
     )

@@ -12,6 +12,7 @@ from sqlalchemy import Connection, Row, bindparam, select
 
 from service.domain.payload import ESTIMATES, estimator_and_prior
 from service.domain.views import GridView
+from service.store.points import precisions
 from service.store.tables import COUNTED, GROUP_COLUMNS, SUMMED, grid_moments, input_group, input_moments
 
 _PARTS = ("shift", "shift2", "sd", "bias", "bias_runs")
@@ -50,13 +51,13 @@ def summarise(connection: Connection, grid: GridView, limit: int, offset: int = 
         "state": grid.state,
         "n_runs": grid.n_runs,
         "n_stored": stored,
-        "rows": _rows(connection, found[:limit]) if found else [],
+        "rows": _rows(connection, grid, found[:limit]) if found else [],
         "overall": {name: _overall(whole.get(estimator_and_prior(name))) for name in ESTIMATES} if stored else {},
         "next": str(offset + limit) if len(found) > limit else None,
     }
 
 
-def _rows(connection: Connection, inputs: Sequence[Row[Any]]) -> list[dict[str, Any]]:
+def _rows(connection: Connection, grid: GridView, inputs: Sequence[Row[Any]]) -> list[dict[str, Any]]:
     """Each a :class:`service.domain.views.SummaryRow` as plain data."""
     places = {row.id: place for place, row in enumerate(inputs)}
     answers: list[dict[str, Any] | None] = [None] * (len(inputs) * len(ESTIMATES))
@@ -66,10 +67,12 @@ def _rows(connection: Connection, inputs: Sequence[Row[Any]]) -> list[dict[str, 
     estimates = _estimates(known, [inputs[places[row[0]]][1:] for row in known]) if known else []
     for row, answer in zip(known, estimates, strict=True):
         answers[places[row[0]] * len(ESTIMATES) + _PLACES[row[1:3]]] = answer
+    known_to = {} if grid.until is None else precisions(connection, grid.id, places)
     return [
         {
             "input": dict(zip(GROUP_COLUMNS, row[1:], strict=False)),
             "n_runs": row.runs,
+            "precision": known_to.get(row.id),
             "estimates": dict(
                 zip(ESTIMATES, answers[place * len(ESTIMATES) : (place + 1) * len(ESTIMATES)], strict=True)
             ),

@@ -94,6 +94,10 @@ grid = Table(
     Column("owner", String(64)),
     # What its runs should take on one worker, by stored runs of their kind [s]; null where there was none.
     Column("expected_wall_s", Float),
+    # Where replicates end once the mean bias of their point is known: the rule, and the number of points. Run k of a
+    # point is that at place k * points + place of the point.
+    Column("until", JSON(none_as_null=True)),
+    Column("points", Integer),
     CheckConstraint("state in ('queued', 'done', 'failed', 'cancelled')", name="state"),
     # How many there are of each, without reading requests of up to a megabyte.
     Index("ix_grid_state_storing", "state", "storing"),
@@ -138,7 +142,7 @@ run = Table(
     UniqueConstraint("grid_id", "ordinal"),
     UniqueConstraint("grid_id", "digest"),
     CheckConstraint(
-        "state in ('queued', 'paused', 'leased', 'done', 'failed', 'quarantined', 'cancelled')",
+        "state in ('queued', 'paused', 'leased', 'done', 'failed', 'quarantined', 'cancelled', 'not_needed')",
         name="state",
     ),
     CheckConstraint("kind in ('realization', 'image')", name="kind"),
@@ -233,6 +237,23 @@ input_group = Table(
     Column("cpu_s", Float, nullable=False),
     UniqueConstraint("grid_id", "digest"),
     Index("ix_input_order", "grid_id", *GROUP_COLUMNS, "id"),
+)
+
+# Of grids with a rule, how well the mean bias of each point is known that has a result.
+point = Table(
+    "point",
+    metadata,
+    Column("grid_id", ForeignKey("grid.id"), primary_key=True),
+    Column("place", Integer, primary_key=True, autoincrement=False),
+    Column("input_id", ForeignKey("input.id"), nullable=False),
+    # With an answer of the rule's estimator.
+    Column("runs", Integer, nullable=False),
+    # Null of fewer than two.
+    Column("standard_error", Float),
+    # How many replicates it should take in all.
+    Column("wanted", Integer, nullable=False),
+    # When it was known well enough for the first time; from then on no replicate waits.
+    Column("reached_at", UtcDateTime),
 )
 
 

@@ -9,7 +9,15 @@ from service.store.map_rows import MapRow
 from service.web.rendering import MINUS, signed
 
 _STEPS = ((1.25, "3"), (0.5, "2"), (0.1, "1"))
-_SIGNS = {"leased": "▸", "failed": "✕", "quarantined": "✕", "cancelled": "✕", "paused": "‖", "queued": "·"}
+_SIGNS = {
+    "leased": "▸",
+    "failed": "✕",
+    "quarantined": "✕",
+    "cancelled": "✕",
+    "not_needed": "○",
+    "paused": "‖",
+    "queued": "·",
+}
 
 
 @dataclass(frozen=True)
@@ -46,8 +54,9 @@ def bias_map(runs: Iterable[MapRow], most: int) -> BiasMap:
 
 def _cell(run: MapRow) -> Cell:
     if run.state != "done":
-        look = {"leased": "leased", "queued": "queued", "paused": "queued"}.get(run.state, "failed")
-        return Cell(run.run_id, look, _SIGNS[run.state], f"{run.label}: {run.state}")
+        waits = dict.fromkeys(("queued", "paused", "not_needed"), "queued")
+        look = {"leased": "leased", **waits}.get(run.state, "failed")
+        return Cell(run.run_id, look, _SIGNS[run.state], f"{run.label}: {run.state.replace('_', ' ')}")
     if run.bias is None:
         return Cell(run.run_id, "z", "?", f"{run.label}: no answer of the recommended estimator")
     size = next((step for reach, step in _STEPS if abs(run.bias) > reach), "")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import Connection, event
@@ -20,7 +20,7 @@ from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.leases import Lease, Outcome, end_attempts, leased_by
 from service.store.queue import Failure, RunQueue
-from tests.service.plans import body, planned, result_of, submit
+from tests.service.plans import body, planned, result_of, submit, submit_until, until
 
 DEAD = 9
 BROKEN = Failure(Outcome.ERROR, "error", "broken", retries=1)
@@ -102,6 +102,28 @@ def _last(mine: Stores) -> Scene:
     return Scene(grid_id, generation, tuple(mine.queue.claim(generation, 1)))
 
 
+def _nearly_known(mine: Stores) -> Scene:
+    """Of six replicates three are needed: two are stored, two are under way and two wait."""
+    grid_id = submit_until(mine.grids, 1, until(1.0, at_most=6))
+    generation = mine.lead()
+    first, second, *leases = mine.queue.claim(generation, 4)
+    mine.queue.store_all([(lease, result_of(lease)) for lease in (first, second)])
+    return Scene(grid_id, generation, tuple(leases))
+
+
+def _known(mine: Stores) -> Scene:
+    """The last replicate of a point that is known well enough is still under way."""
+    scene = _nearly_known(mine)
+    mine.queue.store(scene.leases[0], result_of(scene.leases[0]))
+    return replace(scene, leases=scene.leases[1:])
+
+
+def _known_but_failed(mine: Stores) -> Scene:
+    scene = _known(mine)
+    mine.queue.fail(scene.leases[0], PERMANENT)
+    return scene
+
+
 @dataclass(frozen=True)
 class Operation:
     """What a process was about to do when it died, and what was there before."""
@@ -146,6 +168,10 @@ OPERATIONS = {
     "cancel running": Operation(lambda mine, scene: mine.queue.cancel_leased(scene.leases[0]), _cancelled),
     "pause": Operation(lambda mine, scene: mine.grids.pause(scene.grid_id)),
     "resume": Operation(lambda mine, scene: mine.grids.resume(scene.grid_id), _paused),
+    "store what is enough": Operation(_store, _nearly_known),
+    "hand back what is not needed": Operation(lambda mine, scene: mine.queue.hand_back(scene.leases), _known),
+    "take-over of what is not needed": Operation(lambda mine, _: mine.lead(), _known),
+    "revive what is not needed": Operation(lambda mine, scene: mine.grids.revive(scene.grid_id), _known_but_failed),
     "revive": Operation(lambda mine, scene: mine.grids.revive(scene.grid_id), _failed),
 }
 

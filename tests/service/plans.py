@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 from service.domain.payload import ResultPayload, read_payload
 from service.domain.plan import PlannedRun
+from service.domain.precision import Until
 from service.domain.requests import GridRequest, plan
 from service.store.grids import GridStore
 from service.store.leases import Lease
@@ -22,6 +24,25 @@ def body(runs: int, seed: int = 0) -> dict[str, object]:
 @cache
 def planned(runs: int, seed: int = 0) -> tuple[PlannedRun, ...]:
     return tuple(plan(GridRequest.model_validate(body(runs, seed)), 100_000))
+
+
+def until(error: float, at_most: int, at_least: int = 3) -> Until:
+    return Until(error=error, at_most=at_most, at_least=at_least)
+
+
+def body_until(points: int, rule: Until) -> dict[str, object]:
+    """A request for replicates of one or two inputs, until the rule ends them."""
+    return {**BODY, "n": [2, 4][:points], "until": rule.model_dump()}
+
+
+@cache
+def planned_until(points: int, rule: Until) -> tuple[PlannedRun, ...]:
+    return tuple(plan(GridRequest.model_validate(body_until(points, rule)), 100_000))
+
+
+def submit_until(grids: GridStore, points: int, rule: Until, **more: Any) -> str:
+    """Store a grid whose replicates end; its id."""
+    return grids.create(body_until(points, rule), lambda: planned_until(points, rule), until=rule, **more).grid.id
 
 
 def submit(grids: GridStore, runs: int, seed: int = 0) -> str:

@@ -15,7 +15,7 @@ import logging
 import math
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -40,6 +40,7 @@ from hypothesis.stateful import (
 from sqlalchemy import Connection, event, func, select
 from sqlalchemy.exc import OperationalError
 
+from service.domain.precision import Until, standard_error
 from service.domain.states import TERMINAL_STATES, RunState
 from service.store.database import Database
 from service.store.grids import GridStore
@@ -51,14 +52,17 @@ from service.store.tables import attempt, grid, result, run
 from tests.drills.drill import THROW_AWAY
 from tests.drills.postgres import FAST, postgres_server
 from tests.service.conftest import Clock, empty
-from tests.service.plans import body, planned, result_of
+from tests.service.plans import body, body_until, planned, planned_until, result_of, until
 
 RETRY_S = 1.0
 TTL_S = 30.0
 ENGINES = (None, "e" * 64, "f" * 64)
-QUEUED, PAUSED, LEASED, DONE, FAILED, QUARANTINED, CANCELLED = (
-    RunState(name) for name in ("queued", "paused", "leased", "done", "failed", "quarantined", "cancelled")
+QUEUED, PAUSED, LEASED, DONE, FAILED, QUARANTINED, CANCELLED, NOT_NEEDED = (
+    RunState(name)
+    for name in ("queued", "paused", "leased", "done", "failed", "quarantined", "cancelled", "not_needed")
 )
+RULES = (None, None, until(1.0, at_most=5), until(0.13, at_most=6), until(1e-9, at_most=3))
+"""Results scatter by 0.1: three of them are enough for the first, three or four for the next, none for the last."""
 
 
 class Answer(Enum):
@@ -109,6 +113,8 @@ class ModelRun:
     charged_from: int = 0
     ready_by: float = 0.0
     """Seconds after which it must be claimable; for ever where a clock was wrong that nobody has looked at yet."""
+    place: int = 0
+    """Of its point."""
     charged: Counter[Outcome] = field(default_factory=Counter)
 
 
@@ -120,6 +126,11 @@ class ModelGrid:
     runs: dict[str, ModelRun] = field(default_factory=dict)
     paused: bool = False
     cancelled: bool = False
+    rule: Until | None = None
+    biases: dict[int, list[float]] = field(default_factory=lambda: defaultdict(list))
+    """By point."""
+    reached: set[int] = field(default_factory=set)
+    """Points of which no replicate waits any more."""
 
     @property
     def ended(self) -> bool:
@@ -179,10 +190,30 @@ class Queue(RuleBasedStateMachine):
         self.close(found.grid)
 
     def requeue(self, found: ModelRun, delay: float = 0.0) -> RunState:
-        where = CANCELLED if found.grid.cancelled else PAUSED if found.grid.paused else QUEUED
+        where = CANCELLED if found.grid.cancelled else self.waiting(found)
         found.ready_by = max(found.ready_by, self.seconds + delay)
         self.end(found, where)
         return where
+
+    @staticmethod
+    def waiting(found: ModelRun) -> RunState:
+        """Where a run belongs that might be run."""
+        return NOT_NEEDED if found.place in found.grid.reached else PAUSED if found.grid.paused else QUEUED
+
+    def judge(self, stored: list[Lease]) -> None:
+        """Results have come: where the mean bias of a point is known well enough now, nobody waits for others of it."""
+        for lease in stored:
+            found, estimate = self.runs[lease.run_id], result_of(lease).estimates["image_wide"]
+            assert estimate is not None
+            found.grid.biases[found.place].append(estimate.magnitude.mean - (estimate.magnitude.truth or 0.0))
+        for mine, place in [(self.runs[lease.run_id].grid, self.runs[lease.run_id].place) for lease in stored]:
+            known = mine.biases[place]
+            if mine.rule is not None and mine.rule.is_kept(standard_error(known), len(known)):
+                mine.reached.add(place)
+            for found in mine.runs.values():
+                if found.state in {QUEUED, PAUSED} and found.place in mine.reached:
+                    found.state = NOT_NEEDED
+            self.close(mine)
 
     @staticmethod
     def close(of: ModelGrid) -> None:
@@ -212,24 +243,33 @@ class Queue(RuleBasedStateMachine):
     # What processes do.
 
     @rule(
-        target=grids, runs=st.integers(1, 4), engine=st.sampled_from(ENGINES), keyed=st.booleans(), answer=ANSWERS
-    )  # fmt: skip
-    def submit(self, runs: int, engine: str | None, keyed: bool, answer: Answer) -> Any:
+        target=grids,
+        runs=st.integers(1, 4),
+        rule=st.sampled_from(RULES),
+        engine=st.sampled_from(ENGINES),
+        keyed=st.booleans(),
+        answer=ANSWERS,
+    )
+    def submit(self, runs: int, rule: Until | None, engine: str | None, keyed: bool, answer: Answer) -> Any:
         self.pass_time(0.001)
         key = f"key-{len(self.model_grids)}" if keyed else None
+        points = (runs + 1) // 2
+        asked = body(runs) if rule is None else body_until(points, rule)
+        plan = planned(runs) if rule is None else planned_until(points, rule)
         said = self.say(
-            answer, lambda: self.grid_store.create(body(runs), lambda: planned(runs), key=key, engine=engine)
-        )
+            answer, lambda: self.grid_store.create(asked, lambda: plan, key=key, engine=engine, until=rule)
+        )  # fmt: skip
         with self.database.read() as connection:
-            rows = connection.execute(select(run.c.id, run.c.grid_id)).all()
+            rows = connection.execute(select(run.c.id, run.c.grid_id, run.c.ordinal)).all()
         made = {row.grid_id for row in rows} - self.model_grids.keys()
         # Without a key nobody can tell the second submission from the first.
         assert len(made) == (2 if len(said) == 2 and not keyed else 1)
         for grid_id in made:
-            self.model_grids[grid_id] = mine = ModelGrid(engine)
+            self.model_grids[grid_id] = mine = ModelGrid(engine, rule=rule)
             for row in rows:
                 if row.grid_id == grid_id:
-                    self.runs[row.id] = mine.runs[row.id] = ModelRun(mine, ready_by=self.from_now())
+                    place = row.ordinal % points
+                    self.runs[row.id] = mine.runs[row.id] = ModelRun(mine, ready_by=self.from_now(), place=place)
         return multiple(*sorted(made))
 
     def from_now(self) -> float:
@@ -281,13 +321,26 @@ class Queue(RuleBasedStateMachine):
         """Nothing but a lease that nobody has ended yet, though its dispatcher has crashed, takes it."""
         self.results_come([lease], Answer.COMES)
 
+    @rule(target=grids, rule=st.sampled_from(RULES[2:]), answer=ANSWERS)
+    def replicates_are_run(self, rule: Until, answer: Answer) -> Any:
+        """A grid comes, and results of all but the last lease of its kind: step by step that would be seldom."""
+        made = self.submit(1, rule, None, False, Answer.COMES)
+        self.claim(6, None, False, Answer.COMES)
+        self.results_come(self.of_points()[:-1], answer)
+        return made
+
+    def of_points(self) -> list[Lease]:
+        return [lease for lease in self.seen if self.valid(lease) and self.runs[lease.run_id].grid.rule is not None]
+
     def results_come(self, leases: list[Lease], answer: Answer) -> None:
-        first = []
+        first, stored = [], []
         for lease in leases:
             found = self.valid(lease)
             first.append(Stored.STALE_SAME if found is None else Stored.STORED)
             if found is not None:
                 self.end(found, DONE)
+                stored.append(lease)
+        self.judge(stored)
         results = [(lease, result_of(lease)) for lease in leases]
         self.carry_out(answer, lambda: self.queue.store_all(results), first, [Stored.STALE_SAME] * len(leases))
 
@@ -319,7 +372,7 @@ class Queue(RuleBasedStateMachine):
             found = self.valid(lease)
             if found is not None:
                 found.suspect = found.suspect or how == "suspected"
-                given += self.requeue(found) is not CANCELLED
+                given += self.requeue(found) in {QUEUED, PAUSED}
         if how == "suspected":
             self.carry_out(answer, lambda: self.queue.suspect(these, "one of them"), given, 0)
         else:
@@ -351,14 +404,14 @@ class Queue(RuleBasedStateMachine):
     @rule(target=dead, lease=consumes(leases), answer=ANSWERS)
     def another_engine_answers(self, lease: Lease, answer: Answer) -> Lease:
         found = self.valid(lease)
-        taken = found is not None and self.requeue(found, delay=RETRY_S) is not CANCELLED
+        taken = found is not None and self.requeue(found, delay=RETRY_S) in {QUEUED, PAUSED}
         self.carry_out(answer, lambda: self.queue.refuse_engine(lease, "0" * 64), taken, False)
         return lease
 
     @rule(target=dead, lease=consumes(leases), answer=ANSWERS)
     def dask_loses_it(self, lease: Lease, answer: Answer) -> Lease:
         found = self.valid(lease)
-        given = found is not None and self.requeue(found) is not CANCELLED
+        given = found is not None and self.requeue(found) in {QUEUED, PAUSED}
         self.carry_out(answer, lambda: self.queue.requeue_lost(lease, Outcome.FORGOTTEN, "gone"), given, False)
         return lease
 
@@ -413,7 +466,7 @@ class Queue(RuleBasedStateMachine):
         pairs = {lease.pair for lease in known}
         given = []
         for run_id, found in self.runs.items():
-            if found.state is LEASED and (run_id, found.token) not in pairs and self.requeue(found) is not CANCELLED:
+            if found.state is LEASED and (run_id, found.token) not in pairs and self.requeue(found) in {QUEUED, PAUSED}:
                 given.append(run_id)
         self.carry_out(
             answer, lambda: sorted(self.queue.requeue_forgotten(self.generation, pairs)), sorted(given), []
@@ -497,11 +550,12 @@ class Queue(RuleBasedStateMachine):
         again = [found for found in mine.runs.values() if found.state in {FAILED, QUARANTINED, CANCELLED}]
         self.carry_out(answer, lambda: self.grid_store.revive(grid_id), len(again), 0)
         for found in again:
-            found.state = PAUSED if mine.paused else QUEUED
+            found.state = self.waiting(found)
             found.suspect, found.ready_by, found.charged_from = False, self.from_now(), found.attempts
             found.charged.clear()
         if again:
             mine.cancelled = False
+            self.close(mine)
 
     # What must be true after each of them.
 
@@ -534,7 +588,7 @@ class Queue(RuleBasedStateMachine):
 
 def _final(states: Iterable[RunState]) -> str:
     found = set(states)
-    return "cancelled" if CANCELLED in found else "done" if found == {DONE} else "failed"
+    return "cancelled" if CANCELLED in found else "done" if found <= {DONE, NOT_NEEDED} else "failed"
 
 
 def check(url: str, examples: int, steps: int = 40, *, shrink: bool = True, pieces: bool = False) -> int:

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import func, select
 
 from service.domain.states import OPEN_STATES, RunState
-from service.store.tables import attempt, event, grid, idempotency, leader, result, run
+from service.store.tables import attempt, event, grid, idempotency, leader, point, result, run
 from tests.service.conftest import empty
 from tests.service.crashes import DEAD, OPERATIONS, Scene, Stores, die_at, stores
 from tests.service.plans import body, planned, result_of
@@ -18,16 +18,18 @@ from tests.service.plans import body, planned, result_of
 
 def picture(mine: Stores) -> Any:
     """What is in the database, but for times and tokens."""
+    reached = (point.c.place, point.c.runs, point.c.reached_at.is_(None))
     runs = (run.c.ordinal, run.c.state, run.c.attempt, run.c.suspect, run.c.charged_from, run.c.token.is_(None))
     grids = (grid.c.n_runs, grid.c.state, grid.c.paused_at.is_(None), grid.c.cancelled_at.is_(None))
     with mine.database.read() as connection:
         counts = [
             connection.scalar(select(func.count()).select_from(table))
-            for table in (result, attempt, event, idempotency)
+            for table in (result, attempt, event, idempotency, point)
         ]
         return (
             sorted(map(tuple, connection.execute(select(*runs)))),
             sorted(map(tuple, connection.execute(select(*grids)))),
+            sorted(map(tuple, connection.execute(select(*reached)))),
             counts,
             connection.scalar(select(leader.c.generation)),
         )
@@ -41,11 +43,15 @@ def assert_whole(mine: Stores) -> None:
         ended = list(connection.scalars(select(attempt.c.run_id)))
         done = sorted(connection.scalars(select(event.c.run_id).where(event.c.kind == "run_done")))
         grids = {row.id: row for row in connection.execute(select(grid))}
+        reached = connection.execute(select(point).where(point.c.reached_at.is_not(None))).all()
     assert sorted(row.id for row in runs if row.state == RunState.DONE) == results == done
     for row in runs:
         assert ended.count(row.id) == row.attempt - (row.state == RunState.LEASED)
         assert (row.state == RunState.PAUSED) <= (grids[row.grid_id].paused_at is not None)
         assert (row.state == RunState.QUEUED) <= (grids[row.grid_id].paused_at is None)
+    for place in reached:
+        waiting = {other.state for other in runs if other.grid_id == place.grid_id} & {"queued", "paused"}
+        assert not waiting, "it has one point"
     for grid_id, row in grids.items():
         mine_runs = [other for other in runs if other.grid_id == grid_id]
         assert len(mine_runs) == row.n_runs

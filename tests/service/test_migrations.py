@@ -30,7 +30,7 @@ from service.store.queue import RunQueue, Stored
 from service.store.tables import GROUP_COLUMNS, estimate, grid_moments, input_moments, metadata, result
 from tests.service import history
 from tests.service.conftest import new_database
-from tests.service.plans import result_of, submit
+from tests.service.plans import result_of, submit, submit_until, until
 from tests.service.service_process import ROOT
 
 HEAD = revisions()[-1]
@@ -244,6 +244,21 @@ def test_paused_runs_wait_in_the_queue_of_a_code_that_knows_no_pause(empties: Em
     upgrade(url)
     again = grids.grid(grid_id)
     assert (again.counts.done, again.counts.queued, again.state) == (1, 1, "running")
+
+
+def test_what_is_not_needed_is_cancelled_to_a_code_that_knows_no_such_state(empties: Empties) -> None:
+    url = empties.at(HEAD)
+    database = Database(url, pooled=False)
+    grids, queue = GridStore(database), RunQueue(database)
+    grid_id = submit_until(grids, 1, until(1.0, at_most=5))
+    generation = Leadership(database).take("test")
+    assert generation == 1
+    queue.store_all([(lease, result_of(lease)) for lease in queue.claim(generation, 3)])
+    assert (grids.grid(grid_id).counts.not_needed, grids.grid(grid_id).state) == (2, "done")
+    downgrade(url, "0011")
+    upgrade(url)
+    again = grids.grid(grid_id)
+    assert (again.counts.done, again.counts.cancelled, again.state, again.until) == (3, 2, "cancelled", None)
 
 
 def test_what_older_results_did_not_hold_is_null_after_the_upgrade(empties: Empties, lived: history.Rows) -> None:

@@ -42,7 +42,7 @@ _MOST_AT_ONCE = 20_000
 """Results that are summarised with the page; of more only when it has been shown."""
 _KINDS = (
     "grid", "grid_cancelled", "grid_paused", "grid_resumed", "grid_revived", "run_started", "run_done", "run_failed",
-    "run_quarantined", "run_cancelled", "run_requeued",
+    "run_quarantined", "run_cancelled", "run_requeued", "point_reached",
 )  # fmt: skip
 _FORMAT_NAMES = {"csv": "CSV", "ecsv": "ECSV", "parquet": "Parquet", "vot": "VOTable", "fits": "FITS"}
 """Files of results, by what the address ends with."""
@@ -158,7 +158,7 @@ def _progress(service: Context, grid: GridView) -> dict[str, Any]:
     estimator, prior = estimator_and_prior(DEFAULT_ESTIMATE)
     with service.database.read() as connection:
         cells = map_runs(connection, grid.id, estimator, prior, _MOST_CELLS + 1)
-    names = {"leased": "running"}
+    names = {"leased": "running", "not_needed": "not needed"}
     counts = [(names.get(name, name), count) for name, count in grid.counts.model_dump().items()]
     return {"grid": grid, "counts": counts, "map": bias_map(cells, _MOST_CELLS)}
 

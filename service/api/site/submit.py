@@ -38,7 +38,7 @@ router = APIRouter(include_in_schema=False, route_class=Route)
 _FORM = "application/x-www-form-urlencoded"
 _SHOWN_LABELS = 24
 _MOST_FIELDS = 100
-_MAIN = ("name", "preset", "systems", "n", "r_eff", "magnitude", "l_eta", "replicates", "seed")
+_MAIN = ("name", "preset", "systems", "n", "r_eff", "magnitude", "l_eta", "replicates", "until", "seed")
 _CHOICES = {"preset": preset_names}
 _LABELS = {
     "n": "Sérsic index n", "r_eff": "radius r_eff", "magnitude": "magnitude of the host", "l_eta": "slope l_eta",
@@ -56,6 +56,7 @@ _HINTS = {
     "l_eta": "slope of the deflector's mass, less 1",
     "replicates": "realizations of each point",
     "seed": "of the first realization",
+    "until": 'instead of replicates, until the mean bias is known: as {"quantity": "magnitude", "error": 0.02}',
 }
 
 
@@ -86,7 +87,8 @@ def _take(service: Context, owner: str | None, typed: Mapping[str, str]) -> Resp
         return _page(fields, wrong=wrong, key=key, status=422)
     if typed.get("do") != "submit":
         labels = [run.label for run in islice(runs, _SHOWN_LABELS)]
-        dry = {"n_runs": len(runs), "labels": labels, "cost": service.costs.cost(runs.kinds())}
+        cost = service.costs.cost(runs.kinds())
+        dry = {"n_runs": len(runs), "least_runs": runs.least, "labels": labels, "cost": cost}
         return _page(fields, dry=dry)
     made = service.grids.create(
         body.canonical(),
@@ -96,6 +98,7 @@ def _take(service: Context, owner: str | None, typed: Mapping[str, str]) -> Resp
         engine_digest(),
         owner,
         lambda: service.costs.expected_wall_s(runs.kinds()),
+        body.until,
     )
     return RedirectResponse(f"/grids/{made.grid.id}", 303, {"Cache-Control": "no-store"})
 
