@@ -13,6 +13,7 @@ from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel
 from engine.imaging.telescope import TelescopeState, known_psf, optical_psf, state_psf
 from engine.light.sersic import SersicProfile
+from engine.parametric.fit import ParametricFit
 from engine.parametric.misfit import misfit_significance, shared_noise
 from engine.simulation.simulate import Simulation
 from engine.spec.validation import spec_error
@@ -99,6 +100,13 @@ def test_noise_that_pixels_share_is_no_misfit_and_a_misfit_of_its_size_is(simula
     assert float(np.std(found)) < 1.6
     wavy = noise + 0.5 * np.sin(np.arange(observation.shape[1]) / 2.0)
     assert misfit_significance(wavy, lit, correlation) > 10.0
+
+
+def test_a_psf_that_is_exact_is_left_alone(fit: ParametricFit, simulation: Simulation) -> None:
+    # Not nearly: the very same optics, and nothing marginalised.
+    assert fit.response is simulation.observation.response
+    assert fit.psf is simulation.observation.psf
+    assert fit.error is None
 
 
 def test_optics_are_an_axis_of_a_grid_and_keep_the_digests_of_those_that_were() -> None:

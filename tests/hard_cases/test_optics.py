@@ -5,8 +5,6 @@ from dataclasses import replace
 import pytest
 
 from engine import Analysis, Host, Realization, run
-from engine.parametric.fit import ParametricFit
-from engine.simulation.simulate import Simulation
 from engine.spec.instrument import Optics
 from tests.engine.conftest import cut
 
@@ -37,14 +35,3 @@ def test_a_telescope_out_of_focus_is_no_failure_and_no_bias(name: str, defocus: 
     found = float(told.partition("has ")[2].partition(" nm")[0])
     # To a tenth of HST's breathing, which is the prior.
     assert found == pytest.approx(defocus, abs=1.5)
-
-
-def test_a_psf_that_is_exact_is_left_alone(fit: ParametricFit, simulation: Simulation) -> None:
-    """A simulation whose PSF is the one that the analysis is given.
-
-    Could go wrong: noise is taken for an error of the PSF, which moves the host and widens its intervals. Holds: the
-    exposures' optics are the very same object, and nothing is marginalised.
-    """
-    assert fit.response is simulation.observation.response
-    assert fit.psf is simulation.observation.psf
-    assert fit.error is None

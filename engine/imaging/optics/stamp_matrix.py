@@ -29,7 +29,7 @@ def _average_transfer(frequencies: FloatArray, subrays: int | None) -> FloatArra
 def pixel_kernel(psf: FloatArray, subrays: int | None) -> FloatArray:
     """The PSF for fluxes that are means over ``subrays`` x ``subrays`` points of a pixel, or integrals (None).
 
-    Same shape as ``psf`` (odd by odd). The result has the PSF's sum; a correction of a PSF, that makes no light, has none
+    Same shape as ``psf`` (odd by odd). The result has the PSF's sum; a correction of a PSF makes no light, and has none
     to keep.
     """
     ny, nx = psf.shape
