@@ -6,6 +6,7 @@ inversion may fail, and a fit that is poor is shown with a status that says so.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -28,6 +29,7 @@ from engine.parametric.search import Acceptance
 from engine.plausibility import require_hints, require_lens, unlikely
 from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, of_model, poor_fit, undetected
 from engine.result import Estimate, LensParameter, Quantity
+from engine.several_psfs import PsfFit, averaged
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
 from engine.status import MeasurementStatus, arc_misfit, magnitude_limit, not_detected, prior_dominated, status_of
@@ -73,7 +75,7 @@ class ImageMeasurement:
     neighbours share. ``chi2_per_dof_as_given`` takes the map as it is. ``status`` is that of
     :func:`~engine.status.status_of`; a host that is not detected is fainter than ``host_limit`` (95 %). ``inversion``
     is None where none was asked for, or where it failed, which ``warnings`` then say. ``work`` counts all that was
-    computed, that of an inversion that failed included.
+    computed, that of an inversion that failed included. ``by_psf`` is what each PSF came to where there are several.
     """
 
     host: Estimate
@@ -99,6 +101,7 @@ class ImageMeasurement:
     fit: ParametricFit
     inversion: SampledInversion | None
     work: Work
+    by_psf: tuple[PsfFit, ...] = ()
 
     @property
     def estimator(self) -> str:
@@ -153,6 +156,7 @@ class ImageMeasurement:
             "priors": self.priors,
             "decided_by_priors": list(prior_dominated(fit)),
             "background": fit.background,
+            "psfs": [self._psf_document(one) for one in self.by_psf],
             "profile": self.profile,
             "seed": self.seed,
             "seconds": self.seconds,
@@ -163,6 +167,16 @@ class ImageMeasurement:
             "provenance": self.provenance,
             "read": [asdict(reading) for reading in readings(self.observation)],
             "on_sky": self._on_sky(),
+        }
+
+    def _psf_document(self, found: PsfFit) -> dict[str, float]:
+        """One PSF's part, and the magnitude of the host with it alone."""
+        return {
+            "psf": found.place + 1,
+            "weight": found.weight,
+            "chi2_per_dof": found.chi2_per_dof,
+            "magnitude": rate_to_magnitude(found.flux, self.observation.zero_point),
+            "sd": 2.5 / math.log(10.0) * found.flux_error / found.flux,
         }
 
     def _on_sky(self) -> dict[str, Any]:
@@ -233,6 +247,7 @@ def measure_image(
     inversion: bool = True,
     trust_options: bool = False,
     progress: Progress | None = None,
+    other_psfs: Sequence[FloatArray] = (),
 ) -> ImageMeasurement:
     """Measure the host galaxy in an observation.
 
@@ -260,6 +275,8 @@ def measure_image(
         Go on, with a warning, where the observation cannot be one of a lens (:mod:`engine.plausibility`).
     progress : callable, optional
         Told each stage, and how far it is.
+    other_psfs : sequence of arrays
+        Stamps that the PSF may as well be: the answer is that of all of them (:mod:`engine.several_psfs`).
 
     Raises
     ------
@@ -275,8 +292,7 @@ def measure_image(
     require_hints(observation, theta_E, positions, centre)
     warnings = [*observation.notes, *unlikely(observation, trusting=trust_options)]
     observation, masked = without_lone_pixels(observation)
-    warnings += masked
-    warnings += require_lens(observation, trusting=trust_options)
+    warnings += [*masked, *require_lens(observation, trusting=trust_options)]
     rng = np.random.default_rng(seed)
     with counted() as tally:
         how: dict[str, Any] = {
@@ -291,7 +307,9 @@ def measure_image(
             warnings += told
             observation = cleaned
             found = analyse(observation, image_alone, rng, **how)
-        fit, orientation = found.fit, observation.orientation
+        observation, fit, by_psf, refused = _by_each_psf(observation, found.fit, other_psfs, image_alone, rng, how)
+        warnings += refused
+        orientation = observation.orientation
         if inversion:
             try:
                 found = analyse(observation, analysis, rng, fit=fit, progress=progress)
@@ -347,4 +365,37 @@ def measure_image(
         fit=fit,
         inversion=found.inversion,
         work=tally.work(),
+        by_psf=by_psf,
     )
+
+
+def _by_each_psf(
+    observation: Observation,
+    first: ParametricFit,
+    others: Sequence[FloatArray],
+    analysis: Analysis,
+    rng: np.random.Generator,
+    how: dict[str, Any],
+) -> tuple[Observation, ParametricFit, tuple[PsfFit, ...], list[str]]:
+    """The observation with the best PSF, its fit with the uncertainty of all, each PSF's, and what was refused.
+
+    What the first fit found in the image is where the others begin.
+    """
+    if not others:
+        return observation, first, (), []
+    if observation.response is not None:
+        raise SpecError("psf", f"{1 + len(others)} stamps", "one, where the exposures behind the image are known")
+    known = how | {
+        "agn_images": len(first.agn),
+        "positions": [(image.x, image.y) for image in first.agn] or None,
+        "theta_E": first.lens.theta_E,
+    }
+    fits, refused = [(0, first)], []
+    seen = [observation, *(replace(observation, psf=stamp) for stamp in others)]
+    for place, one in enumerate(seen[1:], start=1):
+        try:
+            fits.append((place, analyse(one, analysis, rng, **known).fit))
+        except (PosteriorError, ObservationError) as error:
+            refused.append(f"psf {place + 1}: no fit: {error}")
+    best, fit, told = averaged(observation, fits)
+    return seen[best], fit, told, refused

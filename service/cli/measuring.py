@@ -26,7 +26,10 @@ _SAID = {"parametric": "parametric fit"}
 def measure(
     image: Annotated[Path, typer.Argument(help="FITS; one of `hostlens simulate` has noise map and PSF in it")],
     noise: Annotated[Path | None, typer.Option(help="1 sigma map; the image's ERR, or made from it, without")] = None,
-    psf: Annotated[Path | None, typer.Option(help="PSF on the image's pixels; any centre")] = None,
+    psfs: Annotated[
+        list[Path] | None,
+        typer.Option("--psf", help="PSF on the image's pixels; any centre; again for others that it may as well be"),
+    ] = None,
     pixel_scale: Annotated[float | None, typer.Option(help="arcsec; the image's header without")] = None,
     zeropoint: Annotated[float | None, typer.Option(help="AB magnitude of 1 e-/s; the image's header without")] = None,
     profile: Annotated[str, typer.Option(help="draft, standard or reference")] = "standard",
@@ -71,7 +74,7 @@ def measure(
     if no_agn and (agn_images or positions):
         raise typer.BadParameter("--no-agn: there are --agn-images or --positions as well")
     outputs = [path for path in (json_file, figure, fits) if path is not None]
-    inputs = [path for path in (image, noise, psf, mask, dq) if path is not None]
+    inputs = [path for path in (image, noise, *(psfs or ()), mask, dq) if path is not None]
     require_apart(outputs, inputs)
     for path, kinds in ((json_file, ()), (figure, PICTURES), (fits, FITS)):
         if path is not None:
@@ -81,12 +84,14 @@ def measure(
     with refusals():
         from rich.console import Console  # noqa: PLC0415 - help needs none
 
-        observation = observation_of_files(
-            image, psf, trust_options=trust_options, noise=noise, pixel_scale=pixel_scale, zero_point=zeropoint,
-            mask=mask, dq=dq, unit=unit, exposure_s=exposure, gain=gain, saturation_e_s=saturation,
-            sky_rms_e_s=sky_rms, good_bits=good_bits, center=center, size=size, extension=extension,
-            psf_oversampling=psf_oversampling,
-        )  # fmt: skip
+        options: dict[str, Any] = {
+            "trust_options": trust_options, "noise": noise, "pixel_scale": pixel_scale, "zero_point": zeropoint,
+            "mask": mask, "dq": dq, "unit": unit, "exposure_s": exposure, "gain": gain, "saturation_e_s": saturation,
+            "sky_rms_e_s": sky_rms, "good_bits": good_bits, "center": center, "size": size, "extension": extension,
+            "psf_oversampling": psf_oversampling,
+        }  # fmt: skip
+        given: list[Path | None] = [*psfs] if psfs else [None]
+        observation, *others = [observation_of_files(image, psf, **options) for psf in given]
         from engine import calibrate, measure_image, readings  # noqa: PLC0415 - seconds, which only an image is worth
 
         for reading in readings(observation):
@@ -96,7 +101,7 @@ def measure(
             found = measure_image(
                 observation, profile=profile, agn_images=0 if no_agn else agn_images, deflector=not no_deflector,
                 shear=shear, theta_E=theta_e, positions=where, centre=centre, seed=seed,
-                inversion=inversion,
+                inversion=inversion, other_psfs=[other.psf for other in others],
                 trust_options=trust_options, progress=lambda stage, _: status.update(_SAID.get(stage, "inversion")),
             )  # fmt: skip
             calibration = None
@@ -223,6 +228,11 @@ def _summary(found: ImageMeasurement) -> list[str]:
         lines.append(f"deflector: {len(found.fit.deflector_gaussians)} Gaussians instead of a Sersic profile")
     told = ", ".join(f"{name} {value:g}" for name, value in found.priors.items())
     lines.append(f"priors of the lens: {told}")
+    lines += [
+        f"psf {one['psf']}: weight {one['weight']:.2f}, chi2/dof {one['chi2_per_dof']:.2f}, "
+        f"host {one['magnitude']:.3f} +- {one['sd']:.3f}"
+        for one in found.to_dict()["psfs"]
+    ]
     if found.host_limit is not None:
         lines.append(f"host: not detected, fainter than {found.host_limit:.2f} mag (95 %)")
     lines.append(f"{len(found.agn)} AGN images, chi2/dof {found.chi2_per_dof:.2f}, {found.estimator}, {found.status}")
