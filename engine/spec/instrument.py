@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, SerializerFunctionWrapHandler, Tag, model_serializer, model_validator
 from pydantic.dataclasses import dataclass
 
 from engine.errors import SpecError
@@ -165,6 +165,17 @@ class Optics:
             if getattr(self, name) != getattr(NOMINAL_OPTICS, name)
         )
         return "_".join(parts) or "nominal"
+
+    @model_serializer(mode="wrap")
+    def _without_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """As it was before there were more than two fields, where the others are not used: digests and keys stay."""
+        document: dict[str, Any] = handler(self)
+        later = ("colour", "residual", "residual_seed", "coarse")
+        return {
+            name: value
+            for name, value in document.items()
+            if name not in later or value != getattr(NOMINAL_OPTICS, name)
+        }
 
 
 _LETTERS = {

@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from engine.spec.analysis import ESTIMATORS, Analysis
-from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, NoiseLevel, Optics
+from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.quantities import STRICT, Identifier, Seed, Slope
 from engine.spec.sky import Host, LensSystem, SystemChoice
 from engine.spec.validation import spec_error
@@ -46,10 +46,6 @@ class Realization:
         # Left out where it is not used, so that realizations from before there was such a field keep their digests.
         if dumped["optics"] is None:
             del dumped["optics"]
-        else:
-            for name in ("colour", "residual", "residual_seed", "coarse"):
-                if dumped["optics"][name] == getattr(NOMINAL_OPTICS, name):
-                    del dumped["optics"][name]
         dumped["analysis"] |= _GONE
         for name in ("agn_position_sd", "background_sd", "max_error"):
             if dumped["analysis"][name] is None:
