@@ -280,8 +280,7 @@ def _migrating() -> Iterator[None]:
     """Where a refusal of the database or of a migration ends the command with a line instead of a traceback."""
     from sqlalchemy.exc import DBAPIError  # noqa: PLC0415 - as alembic
 
-    from service.store.faults import AWAY, one_line  # noqa: PLC0415 - as above
-    from service.store.migrate import MigrationError  # noqa: PLC0415 - as above
+    from service.store.faults import AWAY, MigrationError, one_line  # noqa: PLC0415 - as above
 
     _silence_migrations()
     try:

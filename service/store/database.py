@@ -170,6 +170,15 @@ class Database:
             raise SchemaMismatchError(reason, error) from error
 
 
+def is_at_head(url: str) -> bool:
+    """Whether a database has the schema that this code was written for; a file that is missing is made."""
+    database = Database(url, pooled=False, create=True)
+    try:
+        return database.revision() == REVISION
+    finally:
+        database.close()
+
+
 def _mismatch(found: str | None) -> str:
     if found is None:
         return "the database has no tables of hostlens: run hostlens db upgrade"

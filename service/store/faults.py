@@ -40,6 +40,10 @@ class StatementRefusedError(DatabaseError):
     """The database refuses a statement for what it is, though its driver calls that operational."""
 
 
+class MigrationError(RuntimeError):
+    """The schema cannot be brought to where it was asked to be; nothing has been changed."""
+
+
 AWAY = (OperationalError, InterfaceError, InternalError)
 """What :func:`translate` leaves of these means that the database cannot serve now."""
 

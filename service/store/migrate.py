@@ -14,14 +14,10 @@ from alembic.util.exc import CommandError
 from sqlalchemy import Connection, text
 
 from service.store.database import Database
-from service.store.faults import SchemaMismatchError
+from service.store.faults import MigrationError, SchemaMismatchError
 
 # Any number that no other program on the same database takes for its own advisory lock.
 _LOCK = 4_650_048_421
-
-
-class MigrationError(RuntimeError):
-    """The schema cannot be brought to where it was asked to be; nothing has been changed."""
 
 
 def migrations_folder() -> Path:

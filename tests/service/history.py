@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from sqlalchemy import JSON, Boolean, Connection, DateTime, Float, Integer, MetaData, Table, func, select
+from sqlalchemy import JSON, Boolean, Connection, DateTime, Float, Integer, MetaData, Table, func, inspect, select
 from sqlalchemy.sql.sqltypes import LargeBinary
 
 from service.domain.access import Scope
@@ -62,11 +62,20 @@ def live(database: Database) -> None:
 
 
 def read(connection: Connection) -> Rows:
-    """Every row of every table, by the names that the database itself gives."""
+    """Every row of every table, by the names and in the form that the database itself gives.
+
+    Nothing is made of it: to have SQLAlchemy reflect the tables takes longer than a migration.
+    """
     return {
-        table.name: [dict(row._mapping) for row in connection.execute(select(table).order_by(*table.primary_key))]
-        for table in reflected(connection)
+        name: in_order([dict(row._mapping) for row in connection.exec_driver_sql(f'SELECT * FROM "{name}"')])  # noqa: S608 - our own names
+        for name in inspect(connection).get_table_names()
+        if name != "alembic_version"
     }
+
+
+def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows have no order of their own; one that depends on nothing but what is in them."""
+    return sorted(rows, key=lambda row: str(sorted(row.items())))
 
 
 def reflected(connection: Connection) -> list[Table]:

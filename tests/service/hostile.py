@@ -14,6 +14,8 @@ from service.worker import tasks
 from tests.service.tasks import fast
 
 _FOLDER = "HOSTLENS_DRILL_HARM"
+GREETINGS = ("result", "exception")
+"""Ways to answer a greeting; beside them there is silence, which takes long to be noticed."""
 MODES = ("well", "payload", "raw", "exception", "huge", "deep", "not_json", "events", "nothing", "exit")
 
 
@@ -73,13 +75,15 @@ def answer(spec: dict[str, Any], artefact_url: str) -> dict[str, Any]:
 
 
 def warm_up() -> None:
-    """Harm by greeting, the first time that a worker of this service is greeted."""
-    wish = Path(os.environ[_FOLDER]) / "greeting"
-    if wish.exists():
-        kind = wish.read_text()
-        wish.unlink()
+    """Harm by greeting, once in each of the ways that the folder names."""
+    for kind in (*GREETINGS, "silence"):
+        try:
+            (Path(os.environ[_FOLDER]) / f"greeting-{kind}").unlink()
+        except FileNotFoundError:
+            continue
         if kind == "exception":
             raise HarmfulError
         if kind == "silence":
             time.sleep(3600)
         tasks.to_bytes = lambda _: Harmful()  # type: ignore[assignment, return-value]
+        return

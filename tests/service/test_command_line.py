@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
 import subprocess
@@ -413,8 +414,8 @@ def test_closed_and_broken_streams_and_an_ascii_locale_are_no_reason_to_fail(tmp
 
 
 def test_a_service_whose_output_nobody_reads_or_that_has_none_goes_on(tmp_path: Path) -> None:
-    """A pipe holds 64 KiB, and each request is a line of the log, of a hundred bytes."""
-    for redirection, requests in (("unread", 900), ("closed", 10)):
+    """The pipe holds 4 KiB, and each request is a line of the log, of a hundred bytes."""
+    for redirection, requests in (("unread", 100), ("closed", 10)):
         with serving_into(tmp_path / redirection, redirection) as service:
             for _ in range(requests):
                 service.client.grids(limit=1)
@@ -437,6 +438,7 @@ def serving_into(folder: Path, redirection: str) -> Iterator[Any]:
         command = ["sh", "-c", 'exec "$@" 0<&- 1>&- 2>&-', "sh", *command]
     else:
         read_end, write_end = os.pipe()
+        fcntl.fcntl(write_end, fcntl.F_SETPIPE_SZ, 4096)
         options = {"stdout": write_end, "stderr": write_end}
     try:
         service.started.append(subprocess.Popen(command, cwd=folder, env=service.environment, **options))

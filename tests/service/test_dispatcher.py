@@ -9,6 +9,7 @@ from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 from distributed import KilledWorker
@@ -184,7 +185,9 @@ class Setting:
         looks = iter(range(steps))
         ended = until or (lambda: self.grids.grid(self.grid_id).finished_at is not None)
         stop: Any = SimpleNamespace(is_set=lambda: next(looks, None) is None or ended(), wait=lambda _: None)
-        self.dispatcher.run(self.pool, stop)  # type: ignore[arg-type]
+        # Where every worker is busy the loop waits so long for one that is not, and here nobody comes meanwhile.
+        with patch("service.dispatcher.loop._LOOK_S", 0.02):
+            self.dispatcher.run(self.pool, stop)  # type: ignore[arg-type]
 
 
 def test_a_result_is_kept_while_the_database_is_away_and_nothing_is_claimed_meanwhile(

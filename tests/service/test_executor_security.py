@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import psutil
-import pytest
 
-from tests.service.hostile import MODES
+from tests.service.hostile import GREETINGS, MODES
 from tests.service.plans import body
 from tests.service.service_process import Serving, eventually, serving
 
@@ -20,15 +19,22 @@ def harmed(folder: Path, service: Serving) -> list[list[str]]:
 
 
 def test_nothing_that_a_worker_answers_becomes_code_in_the_dispatcher(tmp_path: Path) -> None:
+    """Neither to a greeting, by which a worker is refused and replaced, nor to a run."""
     harm = tmp_path / "harm"
     harm.mkdir()
+    for kind in GREETINGS:
+        (harm / f"greeting-{kind}").touch()
     settings = {
         "HOSTLENS_TASK": "tests.service.hostile:answer",
         "HOSTLENS_RETRY_DELAY_S": "0.1",
         "HOSTLENS_DRILL_HARM": str(harm),
         "HOSTLENS_DRILL_SLEEP": "0.1",
+        "HOSTLENS_WORKERS": "1",
     }
     with serving(tmp_path, **settings) as service:
+        # It is ready, so both greetings have been given and a third worker's was plain data.
+        assert list(harm.glob("greeting-*")) == []
+        assert service.log.read_text().count("cannot be used") == len(GREETINGS)
         grid = service.client.submit(body(len(MODES)))
         ended = service.client.wait(grid.id, timeout_s=300)
         runs = {
@@ -49,20 +55,3 @@ def test_nothing_that_a_worker_answers_becomes_code_in_the_dispatcher(tmp_path: 
         again = service.client.submit(body(2, seed=0))
         eventually(lambda: service.client.status(again.id).finished_at is not None, what="the end of another grid")
         assert service.child("service.dispatcher") == dispatcher
-
-
-@pytest.mark.parametrize("kind", ["result", "exception"])
-def test_a_greeting_that_is_not_plain_data_is_refused_and_the_worker_replaced(tmp_path: Path, kind: str) -> None:
-    harm = tmp_path / "harm"
-    harm.mkdir()
-    (harm / "greeting").write_text(kind)
-    settings = {
-        "HOSTLENS_TASK": "tests.service.hostile:answer",
-        "HOSTLENS_DRILL_HARM": str(harm),
-        "HOSTLENS_WORKERS": "1",
-    }
-    with serving(tmp_path, **settings) as service:
-        assert "cannot be used" in service.tail()
-        dispatcher = service.child("service.dispatcher")
-        assert dispatcher is not None
-        assert not (harm / str(dispatcher.pid)).exists(), harmed(harm, service)

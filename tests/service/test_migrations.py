@@ -15,10 +15,10 @@ from typer.testing import CliRunner
 from service.cli.app import app
 from service.domain.views import Summary
 from service.store.database import Database
+from service.store.faults import MigrationError
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
 from service.store.migrate import (
-    MigrationError,
     current,
     differences,
     downgrade,
@@ -33,7 +33,14 @@ from tests.service.conftest import new_database
 from tests.service.plans import result_of, submit, submit_until, until
 from tests.service.service_process import ROOT
 
-HEAD = revisions()[-1]
+REVISIONS = revisions()
+HEAD = REVISIONS[-1]
+OFTEN = frozenset({REVISIONS[0], "0003", "0007", *REVISIONS[-3:-1]})
+"""Revisions whose rows ``make test`` migrates: the first, those before results were taken apart, and the newest ones.
+
+From each there, back and there again takes a time that grows with the square of their number, and steps that have been
+released do not change: the others are for ``make check-long``.
+"""
 
 
 @pytest.fixture(scope="module", params=["sqlite", pytest.param("postgresql", marks=pytest.mark.postgres)])
@@ -58,11 +65,15 @@ class Empties:
         return f"sqlite:///{file}"
 
     def at(self, revision: str) -> str:
-        """One that has been brought to a revision: what that takes is done once for each."""
+        """One that has been brought to a revision: what that takes is done once for each, from the one before."""
         if revision not in self._migrated:
-            self._migrated[revision] = self()
-            upgrade(self._migrated[revision], revision)
-        template = self._migrated[revision]
+            place = REVISIONS.index(revision)
+            url = self.at(REVISIONS[place - 1]) if place else self()
+            upgrade(url, revision)
+            self._migrated[revision] = url
+        return self._copy(self._migrated[revision])
+
+    def _copy(self, template: str) -> str:
         if self._server is not None:
             return self(like=str(make_url(template).database))
         url = self()
@@ -88,29 +99,23 @@ def lived(empties: Empties) -> history.Rows:
 
 
 def test_the_tree_is_one_line() -> None:
-    found = revisions()
-    assert len(found) == len(set(found)) >= 1
+    assert len(REVISIONS) == len(set(REVISIONS)) >= 1
 
 
-@pytest.mark.parametrize("revision", revisions())
+@pytest.mark.parametrize(
+    "revision", [one if one in OFTEN else pytest.param(one, marks=pytest.mark.long) for one in REVISIONS]
+)
 def test_rows_of_every_revision_outlive_the_upgrade_the_downgrade_and_the_next_upgrade(
     revision: str, empties: Empties, lived: history.Rows
 ) -> None:
     url = empties.at(revision)
     assert current(url) == revision
-    database = Database(url, pooled=False)
-    with database.write() as connection:
-        history.write(connection, lived)
-    with database.read() as connection:
-        before = history.read(connection)
-    assert all(before.values()), f"a table without rows: {before.keys()}"
-
+    database, before = _filled(url, lived)
     upgrade(url)
     assert differences(url) is None
     _assert_kept(database, before)
     _assert_readable(database, lived)
     _assert_working(database)
-
     with database.read() as connection:
         newest = history.read(connection)
     downgrade(url, revision)
@@ -118,6 +123,17 @@ def test_rows_of_every_revision_outlive_the_upgrade_the_downgrade_and_the_next_u
     upgrade(url)
     assert differences(url) is None
     _assert_kept(database, {name: rows for name, rows in newest.items() if name in before}, before)
+    database.close()
+
+
+def _filled(url: str, lived: history.Rows) -> tuple[Database, history.Rows]:
+    """A database with rows in each of its tables, whatever its revision, and those rows."""
+    database = Database(url, pooled=False)
+    with database.write() as connection:
+        history.write(connection, lived)
+        before = history.read(connection)
+    assert all(before.values()), f"a table without rows: {before.keys()}"
+    return database, before
 
 
 def _assert_kept(database: Database, before: history.Rows, columns_of: history.Rows | None = None) -> None:
@@ -133,7 +149,7 @@ def _assert_kept(database: Database, before: history.Rows, columns_of: history.R
 
 
 def _cut(rows: list[dict[str, Any]], columns: set[str]) -> list[dict[str, Any]]:
-    return [{column: row[column] for column in sorted(columns)} for row in rows]
+    return history.in_order([{column: row[column] for column in columns} for row in rows])
 
 
 def _assert_readable(database: Database, lived: history.Rows) -> None:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import arviz
 import numpy as np
 import pytest
 from astropy.io import fits
@@ -112,6 +111,8 @@ def test_the_fits_of_a_run_has_its_maps_its_chain_and_its_origin(ran: Ran) -> No
 
 def test_the_chain_is_read_by_arviz(ran: Ran, tmp_path: Path) -> None:
     (tmp_path / "chain.nc").write_bytes(ran.get("chain.nc").content)
+    import arviz  # takes longer to load than all else here, and each process of the tests would
+
     found = arviz.from_netcdf(tmp_path / "chain.nc")
     with np.load(io.BytesIO(ran.get("products").content)) as arrays:
         samples, names = arrays["chain"], [str(name) for name in arrays["parameter_names"]]

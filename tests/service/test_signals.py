@@ -85,7 +85,7 @@ SERVICES = {
 }
 
 
-@pytest.mark.parametrize("starts", [4, pytest.param(40, marks=[pytest.mark.long, pytest.mark.timeout(3600)])])
+@pytest.mark.parametrize("starts", [3, pytest.param(40, marks=[pytest.mark.long, pytest.mark.timeout(3600)])])
 @pytest.mark.parametrize("name", SERVICES)
 def test_a_service_that_is_stopped_at_any_moment_of_its_start_ends_with_0_and_leaves_nobody(
     name: str, starts: int, tmp_path: Path, migrated_sqlite: Path

@@ -72,7 +72,7 @@ def test_a_run_that_needs_more_memory_than_a_worker_has_is_charged_with_that_and
 def test_a_worker_that_never_answers_its_greeting_is_replaced(tmp_path: Path) -> None:
     harm = tmp_path / "harm"
     harm.mkdir()
-    (harm / "greeting").write_text("silence")
+    (harm / "greeting-silence").touch()
     settings = {
         "HOSTLENS_TASK": "tests.service.hostile:answer",
         "HOSTLENS_DRILL_HARM": str(harm),

@@ -14,9 +14,10 @@ from service.domain.payload import ESTIMATES, estimator_and_prior
 from service.domain.requests import GridRequest, plan
 from service.domain.views import Summary
 from service.store.database import Database
+from service.store.faults import MigrationError
 from service.store.grids import GridStore
 from service.store.leadership import Leadership
-from service.store.migrate import MigrationError, downgrade, upgrade
+from service.store.migrate import downgrade, upgrade
 from service.store.queue import RunQueue
 from service.store.tables import GROUP_COLUMNS, SUMMED, WORK, estimate, grid_moments, input_group, input_moments, result
 from tests.service.plans import result_of, submit
