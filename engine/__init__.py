@@ -23,6 +23,7 @@ from engine.errors import (
     ObservationError,
     PosteriorError,
     SpecError,
+    StudyError,
 )
 from engine.grid import (
     Expansion,
@@ -110,10 +111,22 @@ if TYPE_CHECKING:
     from engine.imaging.readings import Reading, readings
     from engine.inspection import InversionView, inspect_inversion
     from engine.measure import ImageMeasurement, measure_image
+    from engine.prediction.from_image import traits_of_image
+    from engine.prediction.predictor import (
+        NEAR,
+        PREDICTED,
+        EstimatorPrediction,
+        Predictor,
+        QuantityPrediction,
+        Range,
+        SimulatedRun,
+    )
+    from engine.prediction.traits import LensTraits, resolution_of, traits_of
     from engine.reconstruction import Reconstruction, analyse
     from engine.simulation.scene import check_analysis, check_system
     from engine.simulation.seeds import generator
     from engine.simulation.simulate import Simulation, simulate_realization
+    from engine.study import STUDY_FORMAT, STUDY_METADATA_KEY, Study, read_study
 else:
     _LATE = {
         "engine.acceptance": "check_realization",
@@ -138,10 +151,16 @@ else:
         "engine.imaging.readings": "Reading readings",
         "engine.inspection": "InversionView inspect_inversion",
         "engine.measure": "ImageMeasurement measure_image",
+        "engine.prediction.from_image": "traits_of_image",
+        "engine.prediction.predictor": (
+            "NEAR PREDICTED EstimatorPrediction Predictor QuantityPrediction Range SimulatedRun"
+        ),
+        "engine.prediction.traits": "LensTraits resolution_of traits_of",
         "engine.reconstruction": "Reconstruction analyse",
         "engine.simulation.scene": "check_analysis check_system",
         "engine.simulation.seeds": "generator",
         "engine.simulation.simulate": "Simulation simulate_realization",
+        "engine.study": "STUDY_METADATA_KEY STUDY_FORMAT Study read_study",
     }
     _HOME = {name: module for module, names in _LATE.items() for name in names.split()}
 
@@ -162,10 +181,14 @@ __all__ = [
     "BIN_WIDTH",
     "GROUPINGS",
     "HOST_QUANTITIES",
+    "NEAR",
     "NOMINAL_OPTICS",
+    "PREDICTED",
     "PRINTABLE",
     "PROFILES",
     "STAGES",
+    "STUDY_FORMAT",
+    "STUDY_METADATA_KEY",
     "TRENDS",
     "AccuracyError",
     "AccuracyReport",
@@ -181,6 +204,7 @@ __all__ = [
     "CoverageCurve",
     "EngineError",
     "Estimate",
+    "EstimatorPrediction",
     "Expansion",
     "FigureError",
     "FirstSeed",
@@ -198,6 +222,7 @@ __all__ = [
     "LensEquationError",
     "LensParameter",
     "LensSystem",
+    "LensTraits",
     "Magnitudes",
     "NoiseFromImage",
     "NoiseLevel",
@@ -208,21 +233,27 @@ __all__ = [
     "OpticsChoice",
     "ParameterPrior",
     "PosteriorError",
+    "Predictor",
     "Products",
     "PullSummary",
     "Quantity",
+    "QuantityPrediction",
     "Radii",
+    "Range",
     "Reading",
     "Realization",
     "Reconstruction",
     "Replicates",
     "RunResult",
+    "SimulatedRun",
     "Simulation",
     "Slopes",
     "SourcePlane",
     "SpecError",
     "Spread",
     "StageTime",
+    "Study",
+    "StudyError",
     "SystemChoice",
     "Systems",
     "Trend",
@@ -268,10 +299,12 @@ __all__ = [
     "read_json",
     "read_mapping",
     "read_observation",
+    "read_study",
     "read_system",
     "readings",
     "realization_from_dict",
     "report_from_dict",
+    "resolution_of",
     "run",
     "serial_numbers",
     "simulate_realization",
@@ -280,6 +313,8 @@ __all__ = [
     "system_facts",
     "system_from_mapping",
     "system_names",
+    "traits_of",
+    "traits_of_image",
     "trend_series",
     "write_coolest",
     "write_observation",

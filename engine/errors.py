@@ -56,6 +56,10 @@ class PosteriorError(EngineError, ArithmeticError):
     """No starting point with a finite posterior was found, or the chain cannot be run from it."""
 
 
+class StudyError(EngineError, ValueError):
+    """A file is not one of a study."""
+
+
 class AccuracyError(EngineError):
     """What is asked for, or was measured, makes no report of speed against error."""
 

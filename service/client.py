@@ -14,6 +14,7 @@ from pydantic import BaseModel
 
 from service.connection import AnswerError, ApiError, ClientError, Connection, RequestError, as_json, printable
 from service.domain.answers import ComparisonAnswer, FrontierAnswer, ResultPage, SummaryAnswer, TrendAnswer
+from service.domain.prediction_views import PredictionAnswer
 from service.domain.views import (
     DryRun,
     EventPage,
@@ -204,6 +205,18 @@ class Client:
         """
         wanted: dict[str, Filter] = {"max_error": max_error, "quantity": quantity, **asked}
         return self._connection.call(FrontierAnswer, "GET", _address("/v1/frontier", (), wanted))
+
+    def predict(self, request: Mapping[str, Any] | None = None, /, **fields: Any) -> PredictionAnswer:
+        """Bias and scatter to be expected in a lens that nobody has simulated: the body of POST /v1/predictions.
+
+        As ``system="HE0435", host={"n": 2, "r_eff": 0.4, "magnitude": 21}``, or ``traits={...}``; ``grids`` are those
+        whose runs are to predict it beside the ones that come with hostlens.
+        """
+        content = as_json({**(request or {}), **fields})
+        headers = {"Content-Type": "application/json"}
+        return self._connection.call(
+            PredictionAnswer, "POST", "/v1/predictions", True, content=content, headers=headers
+        )
 
     def results(self, *grid_ids: str, **asked: Filter) -> Iterator[dict[str, Any]]:
         """Each result as a flat row, over some grids or over all; ``asked`` as in :meth:`summary`.

@@ -21,6 +21,7 @@ from service.api import (
     health,
     login,
     measurements,
+    predictions,
     problems,
     results,
     run_files,
@@ -111,7 +112,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_api_route("/openapi.json", _document, include_in_schema=False)
     downloads.install(app)
     figures.install(app)
-    for room in (grids, run_files, figures, results, frontier, exports, measurements, events, catalogue, health, login):
+    for room in (
+        grids, run_files, figures, results, frontier, predictions, exports, measurements, events, catalogue,
+        health, login,
+    ):  # fmt: skip
         app.include_router(room.router)
     site.install(app)
     return app

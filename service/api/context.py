@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, Path, Query, Request
 
@@ -22,6 +23,9 @@ from service.store.leadership import Leadership
 from service.store.measurements import MeasurementStore
 from service.store.outbox import EventStore
 from service.store.tokens import TokenStore
+
+if TYPE_CHECKING:
+    from service.predictions.kept import KeptPredictors
 
 _KEPT_FIGURES, _KEPT_RUNS = 32 * 2**20, 16 * 2**20
 _IDS = frozenset({"grid_id", "run_id"})
@@ -47,6 +51,13 @@ class Context:
         self.artefacts = ArtefactStore(settings.artefacts, patience_s=10.0)
         self.figures = KeptFigures(_KEPT_FIGURES)
         self.runs = KeptBytes(_KEPT_RUNS)
+
+    @cached_property
+    def predictors(self) -> KeptPredictors:
+        """What predicts, made with the first prediction."""
+        from service.predictions.kept import KeptPredictors  # noqa: PLC0415 - loads what computes
+
+        return KeptPredictors()
 
 
 async def _context(request: Request) -> Context:

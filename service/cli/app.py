@@ -20,6 +20,7 @@ from service.cli.connection import settings as _settings
 from service.cli.figures import figures
 from service.cli.frontier import frontier
 from service.cli.measuring import measure
+from service.cli.predict import predict
 from service.cli.replay import replay
 from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
@@ -68,7 +69,9 @@ app = typer.Typer(
 database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
-for command in (*grids.COMMANDS, *pictures.COMMANDS, frontier, figures, accuracy, measure, compare_codes, replay):
+for command in (
+    *grids.COMMANDS, *pictures.COMMANDS, frontier, predict, figures, accuracy, measure, compare_codes, replay,
+):  # fmt: skip
     app.command()(command)
 
 

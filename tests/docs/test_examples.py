@@ -37,6 +37,7 @@ What an image that is measured blindly tells is asserted in tests/engine/test_me
 MADE = {
     "docs/tutorial/first-grid.md": ["grid.json", "summary.json", "run.png", "biases.png"],
     "docs/howto/ask-for-biases.md": ["by_n.json", "trend.json", "comparison.json", "results.json", "results.ecsv"],
+    "docs/howto/predict.md": ["more.json", "cost.txt", "prediction.json"],
     "docs/howto/ask-for-an-error.md": ["frontier.json", "grid.txt", "known.json"],
     "docs/howto/from-python.md": ["bias.svg"],
     "docs/howto/results-to-files.md": ["results.vot", "results.fits", "run.npz", "run.fits", "chain.nc", "run.json"],
