@@ -87,6 +87,7 @@ tables: install-test
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation --write docs/tables/simulation.md
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.evidence_growth
 	OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m benchmarks.scenes --write docs/tables/scenes.md
+	$(BIN)/hostlens study h0licow-vi --from shipped --output build/study && cp build/study/conclusions.md docs/tables/study.md
 
 accuracy: install-test
 	$(BIN)/python -m benchmarks.peers || echo "peers could not be installed: they are left out"

@@ -40,8 +40,8 @@ from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import LensingMatrix, cast_rays, map_rays
 from engine.source.regularisation import SourceModel, sparse_regularisation
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 
 def dense_ln_evidence(

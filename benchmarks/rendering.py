@@ -21,8 +21,8 @@ from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
 from engine.simulation.scene import build_scene
 from engine.simulation.simulate import scene_geometry, simulate
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 LENS = PowerLawLens(1.2171, 0.85, 1.29, 2.0)
 PIXELS, SCALE = 100, 0.08

@@ -37,8 +37,8 @@ from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.simulate import scene_geometry, simulate
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 from tests.engine.angular_solver import AngularSolver
 
 NOISE_DRAWS = 100

@@ -24,8 +24,8 @@ from engine.simulation.simulate import simulate
 from engine.source.lensing_matrix import map_rays
 from engine.source.regularisation import SourceModel, add_regularisation, ln_determinant, sparse_regularisation
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 MODELS = (
     SourceModel((30, 30), "curvature"),

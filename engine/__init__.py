@@ -26,10 +26,12 @@ from engine.errors import (
     StudyError,
 )
 from engine.grid import (
+    Deflectors,
     Expansion,
     FirstSeed,
     Grid,
     GridRun,
+    Hosts,
     Indices,
     Magnitudes,
     Radii,
@@ -52,6 +54,8 @@ from engine.result import (
     StageTime,
 )
 from engine.spec.analysis import PROFILES, Analysis
+from engine.spec.deflector import USUAL_DEFLECTOR, Deflector
+from engine.spec.host import Host, HostImage, HostShape, MadeGalaxy
 from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, NoiseLevel, Optics, OpticsChoice
 from engine.spec.json_text import read_json
 from engine.spec.priors import ParameterPrior
@@ -63,7 +67,7 @@ from engine.spec.realization import (
     spec_digest,
     system_from_mapping,
 )
-from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.sky import LensSystem, SystemChoice
 from engine.spec.validation import PRINTABLE, complaint, field_path, path_steps, spec_error
 from engine.stages import ACCURACY_STAGES, STAGES
 from engine.user_files import read_camera, read_mapping, read_system
@@ -103,6 +107,7 @@ if TYPE_CHECKING:
     from engine.codes.coolest import write_coolest
     from engine.comparison import compare
     from engine.experiment import inspect_simulation, run
+    from engine.host_files import read_host_image
     from engine.imaging.external import observation_from_arrays
     from engine.imaging.external_files import read_external_observation
     from engine.imaging.fits import read_observation, write_observation
@@ -126,7 +131,16 @@ if TYPE_CHECKING:
     from engine.simulation.scene import check_analysis, check_system
     from engine.simulation.seeds import generator
     from engine.simulation.simulate import Simulation, simulate_realization
-    from engine.study import STUDY_FORMAT, STUDY_METADATA_KEY, Study, read_study
+    from engine.study import (
+        STUDY_FORMAT,
+        STUDY_METADATA_KEY,
+        Conclusion,
+        Study,
+        conclusions_markdown,
+        read_study,
+        study_conclusions,
+        verdict,
+    )
 else:
     _LATE = {
         "engine.acceptance": "check_realization",
@@ -143,6 +157,7 @@ else:
         "engine.codes.coolest": "write_coolest",
         "engine.comparison": "compare",
         "engine.experiment": "inspect_simulation run",
+        "engine.host_files": "read_host_image",
         "engine.imaging.external": "observation_from_arrays",
         "engine.imaging.external_files": "read_external_observation",
         "engine.imaging.fits": "read_observation write_observation",
@@ -160,7 +175,9 @@ else:
         "engine.simulation.scene": "check_analysis check_system",
         "engine.simulation.seeds": "generator",
         "engine.simulation.simulate": "Simulation simulate_realization",
-        "engine.study": "STUDY_METADATA_KEY STUDY_FORMAT Study read_study",
+        "engine.study": (
+            "STUDY_FORMAT STUDY_METADATA_KEY Conclusion Study conclusions_markdown read_study study_conclusions verdict"
+        ),
     }
     _HOME = {name: module for module, names in _LATE.items() for name in names.split()}
 
@@ -190,6 +207,7 @@ __all__ = [
     "STUDY_FORMAT",
     "STUDY_METADATA_KEY",
     "TRENDS",
+    "USUAL_DEFLECTOR",
     "AccuracyError",
     "AccuracyReport",
     "Analysis",
@@ -200,8 +218,11 @@ __all__ = [
     "CameraChoice",
     "ChainSummary",
     "Comparison",
+    "Conclusion",
     "Configuration",
     "CoverageCurve",
+    "Deflector",
+    "Deflectors",
     "EngineError",
     "Estimate",
     "EstimatorPrediction",
@@ -212,7 +233,10 @@ __all__ = [
     "GridRun",
     "Grouping",
     "Host",
+    "HostImage",
     "HostQuantity",
+    "HostShape",
+    "Hosts",
     "Identifier",
     "ImageMeasurement",
     "ImagePlane",
@@ -223,6 +247,7 @@ __all__ = [
     "LensParameter",
     "LensSystem",
     "LensTraits",
+    "MadeGalaxy",
     "Magnitudes",
     "NoiseFromImage",
     "NoiseLevel",
@@ -274,6 +299,7 @@ __all__ = [
     "compare",
     "compare_codes",
     "complaint",
+    "conclusions_markdown",
     "configuration_of",
     "coverage_curve",
     "engine_digest",
@@ -296,6 +322,7 @@ __all__ = [
     "pull_summary",
     "read_camera",
     "read_external_observation",
+    "read_host_image",
     "read_json",
     "read_mapping",
     "read_observation",
@@ -310,12 +337,14 @@ __all__ = [
     "simulate_realization",
     "spec_digest",
     "spec_error",
+    "study_conclusions",
     "system_facts",
     "system_from_mapping",
     "system_names",
     "traits_of",
     "traits_of_image",
     "trend_series",
+    "verdict",
     "write_coolest",
     "write_observation",
 ]

@@ -9,7 +9,7 @@ from engine.errors import SpecError
 from engine.imaging.geometry import exposure_geometry
 from engine.imaging.psf import coarsest_subpixel
 from engine.posterior.target import wide_prior
-from engine.simulation.scene import check_analysis, power_law_lens
+from engine.simulation.scene import check_analysis, check_deflector, power_law_lens
 from engine.spec.realization import Realization
 
 _MOST_SUBPIXELS = 8192
@@ -31,6 +31,7 @@ def check_realization(realization: Realization) -> None:
         It names the field within the realization, as ``system.camera.oversampling`` or ``analysis.priors.q``.
     """
     check_analysis(realization)
+    check_deflector(realization)
     _check_sampling(realization)
     _check_priors(realization)
 

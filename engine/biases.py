@@ -20,12 +20,16 @@ from engine.conventions import FloatArray
 from engine.errors import FigureError, NothingToShowError
 from engine.result import IndexPrior, Quantity, RunResult
 from engine.spec.analysis import EstimatorName
+from engine.spec.deflector import USUAL_DEFLECTOR
 from engine.spec.realization import Realization
 
 HostQuantity = Literal["magnitude", "r_eff", "r_eff_galfit", "n", "q", "position_angle", "x", "y"]
 Configuration = Literal["quad", "double", "other"]
 Trend = Literal["arc_magnitude", "agn_contrast", "surface_brightness"]
-Grouping = Literal["configuration", "system", "estimator", "index_prior", "n", "r_eff", "magnitude", "l_eta"]
+Grouping = Literal[
+    "configuration", "system", "estimator", "index_prior", "n", "r_eff", "magnitude", "l_eta", "host_kind",
+    "host_label", "deflector",
+]  # fmt: skip
 HOST_QUANTITIES: tuple[HostQuantity, ...] = get_args(HostQuantity)
 TRENDS: tuple[Trend, ...] = get_args(Trend)
 GROUPINGS: tuple[Grouping, ...] = get_args(Grouping)
@@ -38,18 +42,26 @@ BIN_WIDTH = 0.5
 
 
 class Setting(NamedTuple):
-    """What the paper's serial number stands for (Table 3), in the order in which it counts."""
+    """What the paper's serial number stands for (Table 3), in the order in which it counts; and what it had not."""
 
     l_eta: float
     r_eff: float
-    n: float
+    n: float | None
+    host: str = "sersic"
+    deflector: str = "plain"
+
+    def order(self) -> tuple[float, float, float, str, str]:
+        """What settings are sorted by: hosts without an index come last, by their names."""
+        return self.l_eta, self.r_eff, math.inf if self.n is None else self.n, self.host, self.deflector
 
 
 @dataclass(frozen=True)
 class BiasPoint:
     """One estimate of the host of one simulated run, beside what was put in.
 
-    ``n``, ``r_eff`` [arcsec], ``magnitude`` [AB] and ``l_eta`` are the input, ``seed`` that of the noise.
+    ``n`` (None of a host that is no Sersic profile), ``r_eff`` [arcsec], ``magnitude`` [AB] and ``l_eta`` are the
+    input, ``seed`` that of the noise.
+    ``host_kind``, ``host_label`` and ``deflector`` tell hosts and deflectors apart that are not the usual ones.
     ``recovered`` holds each quantity with its truth. ``arc_magnitude``, ``agn_contrast`` (None without AGN) and
     ``surface_brightness`` as in :class:`~engine.result.RunResult`.
     """
@@ -57,7 +69,7 @@ class BiasPoint:
     run_id: str
     system: str
     configuration: Configuration
-    n: float
+    n: float | None
     r_eff: float
     magnitude: float
     l_eta: float
@@ -68,11 +80,14 @@ class BiasPoint:
     arc_magnitude: float
     agn_contrast: float | None
     surface_brightness: float
+    host_kind: str = "sersic"
+    host_label: str = "sersic"
+    deflector: str = "plain"
 
     @property
     def setting(self) -> Setting:
-        """Slope, radius and index that were put in."""
-        return Setting(self.l_eta, self.r_eff, self.n)
+        """Slope, radius, index, host and deflector that were put in."""
+        return Setting(self.l_eta, self.r_eff, self.n, self.host_label, self.deflector)
 
     def bias(self, quantity: HostQuantity) -> float:
         """Recovered minus true; a FigureError where the quantity or its truth is missing."""
@@ -80,6 +95,11 @@ class BiasPoint:
         if found is None or found.bias is None:
             raise FigureError(f"{quantity}: run {self.run_id} has none with a truth, allowed are results that have")
         return found.bias
+
+    def has_truth(self, quantity: HostQuantity) -> bool:
+        """Whether there is a bias: an older result may lack the quantity, a host that is no profile has no index."""
+        found = self.recovered.get(quantity)
+        return found is not None and found.bias is not None
 
     def sd(self, quantity: HostQuantity) -> float:
         """The standard deviation that the run states."""
@@ -112,6 +132,9 @@ def bias_points(run_id: str, realization: Realization, result: RunResult) -> tup
             arc_magnitude=result.arc_magnitude,
             agn_contrast=result.agn_contrast,
             surface_brightness=result.surface_brightness,
+            host_kind=host.kind,
+            host_label=host.label,
+            deflector=USUAL_DEFLECTOR if realization.deflector is None else realization.deflector.label,
         )
         for found in result.estimates
     )
@@ -122,7 +145,10 @@ def serial_numbers(points: Iterable[BiasPoint]) -> dict[Setting, int]:
 
     Of one system's whole grid of the paper these are the numbers of its Table 3.
     """
-    return {setting: number for number, setting in enumerate(sorted({point.setting for point in points}), 1)}
+    return {
+        setting: number
+        for number, setting in enumerate(sorted({point.setting for point in points}, key=Setting.order), 1)
+    }
 
 
 def group_points(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[BiasPoint, ...]]:
@@ -135,12 +161,13 @@ def group_points(points: Iterable[BiasPoint], by: Grouping) -> dict[str, tuple[B
     """
     if by not in GROUPINGS:
         raise FigureError(f"group by: got {by!r}, allowed is one of {list(GROUPINGS)}")
-    groups: dict[str | float, list[BiasPoint]] = {}
+    groups: dict[str | float | None, list[BiasPoint]] = {}
     for point in points:
         groups.setdefault(getattr(point, by), []).append(point)
     return {
-        key if isinstance(key, str) else f"{by} {key:g}": tuple(groups[key])
-        for key in sorted(groups)  # of one kind: a column is text or numbers
+        key if isinstance(key, str) else f"{by} none" if key is None else f"{by} {key:g}": tuple(groups[key])
+        # Of one kind, a column is text or numbers; what has no number comes last.
+        for key in sorted(groups, key=lambda key: (key is None, key))
     }
 
 

@@ -9,8 +9,8 @@ from engine.conventions import position_angle, rate_to_magnitude
 from engine.digest import engine_digest, engine_versions
 from engine.estimators.summaries import galfit_radius
 from engine.inspection import InversionView
-from engine.light.cell_means import profile_on_grid
-from engine.light.sersic import SersicProfile, flux_in_circle, mean_surface_brightness
+from engine.light.galaxy import Light, flux_within, light_on_grid
+from engine.light.sersic import mean_surface_brightness
 from engine.reconstruction import Reconstruction
 from engine.result import Aperture, Estimate, LensParameter, Quantity, RunResult, SourcePlane, StageTime
 from engine.simulation.scene import Scene
@@ -72,14 +72,14 @@ def compare(
     )
 
 
-def estimate_beside(found: Estimate, host: SersicProfile, zero_point: float) -> Estimate:
-    """An estimate with the truth in each of its quantities."""
+def estimate_beside(found: Estimate, host: Light, zero_point: float) -> Estimate:
+    """An estimate with the truth in each of its quantities; a host that is no Sersic profile has no index."""
     return replace(
         found,
         magnitude=found.magnitude.beside(rate_to_magnitude(host.flux, zero_point)),
         r_eff=found.r_eff.beside(host.r_eff),
         r_eff_galfit=found.r_eff_galfit.beside(galfit_radius(host)),
-        n=found.n.beside(host.n),
+        n=found.n if host.n is None else found.n.beside(host.n),
         q=found.q.beside(host.q),
         position_angle=found.position_angle.beside(position_angle(host.phi), period=180.0),
         x=found.x.beside(host.x),
@@ -104,16 +104,16 @@ def view_beside(view: InversionView, scene: Scene) -> InversionView:
     return replace(view, source_plane=source_beside(view.source_plane, scene.host), traces=tuple(traces))
 
 
-def source_beside(plane: SourcePlane, host: SersicProfile) -> SourcePlane:
+def source_beside(plane: SourcePlane, host: Light) -> SourcePlane:
     """Maps of a source with the true one, averaged over the cells of the grid."""
-    true = profile_on_grid(host, plane.source_x_edges, plane.source_y_edges).reshape(plane.source.shape)
+    true = light_on_grid(host, plane.source_x_edges, plane.source_y_edges).reshape(plane.source.shape)
     return replace(plane, source_truth=true)
 
 
-def _aperture_beside(found: Aperture | None, host: SersicProfile, zero_point: float) -> Aperture | None:
+def _aperture_beside(found: Aperture | None, host: Light, zero_point: float) -> Aperture | None:
     if found is None:
         return None
-    true = rate_to_magnitude(flux_in_circle(host, found.radius), zero_point)
+    true = rate_to_magnitude(flux_within(host, found.radius), zero_point)
     return replace(found, magnitude=found.magnitude.beside(true))
 
 

@@ -11,8 +11,8 @@ from importlib.resources.abc import Traversable
 
 _NUMERIC_PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "emcee", "drizzle", "poppy", "astropy")
 _SUFFIXES = (".py", ".yaml")
-_LEFT_OUT = ("figures", "accuracy", "codes")
-"""Of the digest: what is drawn of a result, measured of the engine, or compared with it, does not change it."""
+_LEFT_OUT = ("figures", "accuracy", "codes", "study")
+"""Of the digest: what is drawn or said of a result, measured of the engine, or compared with it, does not change it."""
 
 
 @cache
@@ -43,7 +43,7 @@ def _walk(folder: Traversable, prefix: str = "") -> list[tuple[str, Traversable]
 def engine_digest() -> str:
     """SHA-256 (hex) over the engine's source and data files and the versions of its numeric packages.
 
-    Left out is what no result depends on: figures, and the report of speed against error.
+    Left out is what no result depends on: figures, the report of speed against error, and what is said of a study.
     """
     digest = hashlib.sha256()
     for name, entry in _walk(files("engine")):

@@ -58,7 +58,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
         generator(realization, _ANALYSIS),
         agn_images=len(scene.agn),
         deflector=scene.deflector is not None,
-        shear=scene.lens.gamma1 != 0.0 or scene.lens.gamma2 != 0.0,
+        shear=scene.lens.sheared,
         fixed_index=scene.host.n,
         progress=progress,
     )
@@ -76,6 +76,6 @@ def inspect_simulation(simulation: Simulation, analysis: Analysis) -> InversionV
         analysis,
         agn_images=len(scene.agn),
         deflector=scene.deflector is not None,
-        shear=scene.lens.gamma1 != 0.0 or scene.lens.gamma2 != 0.0,
+        shear=scene.lens.sheared,
     )
     return view_beside(view, scene)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import product
 from math import prod
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
@@ -23,10 +23,12 @@ from engine.catalogue import (
 )
 from engine.errors import SpecError
 from engine.spec.analysis import Analysis
+from engine.spec.deflector import Deflector
+from engine.spec.host import Host, HostShape
 from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, Dither, NoiseLevel, Optics, OpticsChoice
 from engine.spec.quantities import Count, Identifier, Magnitude, Radius, SersicIndex, Slope
 from engine.spec.realization import Realization
-from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.sky import LensSystem, SystemChoice
 
 PAPER = "h0licow-vi"
 _STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -34,6 +36,8 @@ _SOME = Field(max_length=1000)
 
 Systems = Annotated[tuple[SystemChoice, ...], _SOME]
 Indices = Annotated[tuple[SersicIndex, ...], _SOME]
+Hosts = Annotated[tuple[HostShape, ...], Field(max_length=200)]
+Deflectors = Annotated[tuple[Deflector, ...], Field(max_length=20)]
 Radii = Annotated[tuple[Radius, ...], _SOME]
 Magnitudes = Annotated[tuple[Magnitude, ...], _SOME]
 Slopes = Annotated[tuple[Slope, ...], _SOME]
@@ -49,17 +53,20 @@ class Grid:
     With ``preset`` (``h0licow-vi`` for all eight systems, ``h0licow-vi/HE0435`` for one) the values are those of the
     paper's Table 2, and n, r_eff, magnitude, l_eta cut them: each must then be a subset of the preset's values.
     Without it, ``systems`` (names of the catalogue, or lens systems of one's own) and all four lists of values must be
-    given and every combination is run. ``camera`` takes the place of the systems' own. ``optics``, one or several,
-    spoil the PSF of the sky: each point is run with each, {} being nothing. ``replicates`` repeats each point with
-    seeds seed, seed + 1, ...
+    given and every combination is run. ``hosts`` are galaxies beside, or in the place of, Sersic profiles of the
+    indices ``n``; ``deflectors`` what the lenses have beside their own light and mass, {} being nothing. ``camera``
+    takes the place of the systems' own. ``optics``, one or several, spoil the PSF of the sky: each point is run with
+    each, {} being nothing. ``replicates`` repeats each point with seeds seed, seed + 1, ...
     """
 
     preset: Identifier | None = None
     systems: Systems | None = None
     n: Indices | None = None
+    hosts: Hosts | None = None
     r_eff: Radii | None = None
     magnitude: Magnitudes | None = None
     l_eta: Slopes | None = None
+    deflectors: Deflectors | None = None
     mass_model: Identifier = "recommended"
     noise_level: NoiseLevel = "author"
     optics: OpticsChoice | None = None
@@ -91,9 +98,9 @@ def expand(grid: Grid) -> tuple[GridRun, ...]:
 class Expansion:
     """The runs of a grid in a fixed order: checked and counted at once, made one by one as they are asked for.
 
-    ``samples`` has one run of each system at each slope, ``shares`` how many of the runs each stands for. What these
-    and the values of the lists are refused for is all that a run can be refused for, so neither time nor memory grows
-    with the number of runs. A SpecError says which value is not allowed and what is.
+    ``samples`` has one run of each system at each slope with each deflector, ``shares`` how many of the runs each
+    stands for. What these and the values of the lists are refused for is all that a run can be refused for, so neither
+    time nor memory grows with the number of runs. A SpecError says which value is not allowed and what is.
     """
 
     def __init__(self, grid: Grid) -> None:
@@ -101,8 +108,8 @@ class Expansion:
         self._grid, self._optics = grid, _each_optics(grid)
         self._paper = None if grid.preset is None else _paper_points(grid)
         samples = list(_samples(grid)) if self._paper is None else self._paper
-        by_setting = {(_name(system), l_eta): (system, number, host, l_eta) for system, number, host, l_eta in samples}
-        counts = Counter((_name(system), l_eta) for system, _, _, l_eta in samples)
+        by_setting = {point.setting: point for point in samples}
+        counts = Counter(point.setting for point in samples)
         _require_known_parts(grid, list(by_setting.values()))
         self.samples = tuple(self._run(point, 0, self._optics[0]) for point in by_setting.values())
         each = len(self) // len(samples)
@@ -110,8 +117,7 @@ class Expansion:
 
     def __len__(self) -> int:
         """How many runs there are."""
-        lists = (self._grid.systems, self._grid.n, self._grid.r_eff, self._grid.magnitude, self._grid.l_eta)
-        points = prod(len(values or ()) for values in lists) if self._paper is None else len(self._paper)
+        points = prod(map(len, _axes(self._grid))) if self._paper is None else len(self._paper)
         return points * len(self._optics) * self._grid.replicates
 
     def __iter__(self) -> Iterator[GridRun]:
@@ -128,11 +134,12 @@ class Expansion:
                     yield self._run(point, replicate, optics)
 
     def _run(self, point: _Point, replicate: int, optics: Optics | None) -> GridRun:
-        (system, number, host, l_eta), grid = point, self._grid
+        grid, host = self._grid, point.host
         realization = Realization(
-            system=system,
-            l_eta=l_eta,
+            system=point.system,
+            l_eta=point.l_eta,
             host=host,
+            deflector=point.deflector,
             seed=grid.seed + replicate,
             noise_level=grid.noise_level,
             optics=optics,
@@ -140,13 +147,34 @@ class Expansion:
             camera=grid.camera,
             analysis=grid.analysis,
         )
-        name = f"{number:02d}" if number is not None else f"n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{l_eta:g}"
+        name = point.name if point.number is None else f"{point.number:02d}"
         suffix = f"_{(optics or NOMINAL_OPTICS).label}" if len(self._optics) > 1 else ""
         suffix += f"#{replicate + 1}" if grid.replicates > 1 else ""
-        return GridRun(label=f"{realization.system_name}/{name}{suffix}", paper_run=number, realization=realization)
+        return GridRun(f"{realization.system_name}/{name}{suffix}", point.number, realization)
 
 
-_Point = tuple[str | LensSystem, int | None, Host, float]
+@dataclass(frozen=True)
+class _Point:
+    """What runs of one point have in common."""
+
+    system: str | LensSystem
+    number: int | None
+    host: Host
+    l_eta: float
+    deflector: Deflector | None = None
+
+    @property
+    def setting(self) -> tuple[str, float, str]:
+        """What a run can be refused for as a whole."""
+        return _name(self.system), self.l_eta, "" if self.deflector is None else self.deflector.label
+
+    @property
+    def name(self) -> str:
+        """What a run is called within its system."""
+        host = self.host
+        shape = host.label if host.n is None or host.name is not None else f"n{host.n:g}"
+        more = "" if self.deflector is None else f"_{self.deflector.label}"
+        return f"{shape}_r{host.r_eff:g}_m{host.magnitude:g}_l{self.l_eta:g}{more}"
 
 
 def _require_own_names(grid: Grid) -> None:
@@ -182,9 +210,9 @@ def _require_known_parts(grid: Grid, points: Sequence[_Point]) -> None:
     """Every camera, dither pattern and mass model that the points name must be there."""
     if isinstance(grid.camera, str):
         load_camera(grid.camera)
-    for choice, _, _, l_eta in points:
-        system = load_system(choice) if isinstance(choice, str) else choice
-        system.mass_model(grid.mass_model, l_eta)
+    for point in points:
+        system = load_system(point.system) if isinstance(point.system, str) else point.system
+        system.mass_model(grid.mass_model, point.l_eta)
         if isinstance(system.camera, str):
             load_camera(system.camera)
         if isinstance(system.exposures.dither, str):
@@ -195,6 +223,9 @@ def _paper_points(grid: Grid) -> list[_Point]:
     table = read_catalogue("h0licow_vi")
     if grid.preset not in preset_names():
         raise SpecError("preset", grid.preset, f"one of {list(preset_names())}")
+    for field in ("hosts", "deflectors"):
+        if getattr(grid, field) is not None:
+            raise SpecError(field, [one.label for one in getattr(grid, field)], "nothing where there is a preset")
     _, _, only = grid.preset.partition("/")
     names = [only] if only else list(table["systems"])
     if grid.systems is not None:
@@ -221,29 +252,58 @@ def _paper_points(grid: Grid) -> list[_Point]:
             r_eff, magnitude = float(values["r_eff"][entry["r_eff"]]), float(values["magnitude"][rank - 1])
             cuts = ((n, grid.n), (l_eta, grid.l_eta), (r_eff, grid.r_eff), (magnitude, grid.magnitude))
             if all(wanted is None or value in wanted for value, wanted in cuts):
-                points.append((name, number, Host(n=n, r_eff=r_eff, magnitude=magnitude), l_eta))
+                points.append(_Point(name, number, Host(n=n, r_eff=r_eff, magnitude=magnitude), l_eta))
     if not points:
         raise SpecError("grid", "no run left", "cuts that leave at least one of the preset's runs")
     return points
 
 
 def _samples(grid: Grid) -> Iterator[_Point]:
-    """Of a free grid, the first point of each system at each slope."""
-    for field in ("systems", "n", "r_eff", "magnitude", "l_eta"):
+    """Of a free grid, the first point of each system at each slope with each deflector."""
+    needed = ("systems", "r_eff", "magnitude", "l_eta", *(("n",) if grid.hosts is None else ()))
+    for field in (*needed, *(field for field in ("n", "hosts", "deflectors") if getattr(grid, field) is not None)):
         values = getattr(grid, field)
         if not values:
             raise SpecError(field, values, "a non-empty list where no preset is given")
-        entries = [_name(system) for system in values] if field == "systems" else values
+    for field in ("systems", "n", "hosts", "r_eff", "magnitude", "l_eta", "deflectors"):
+        entries = [_entry(value) for value in getattr(grid, field) or ()]
         if len(set(entries)) != len(entries):
-            raise SpecError(field, entries, "a list without repeated values")
-    first = {name: getattr(grid, name)[:1] for name in ("n", "r_eff", "magnitude")}
-    return _free_points(dataclasses.replace(grid, **first))
+            unnamed = ", or names of their own for those that differ" if field in ("hosts", "deflectors") else ""
+            raise SpecError(field, entries, f"a list without repeated values{unnamed}")
+    usual = [f"n{index:g}" for index in grid.n or ()]
+    taken = [shape.label for shape in grid.hosts or () if shape.label in usual]
+    if taken:
+        raise SpecError("hosts", taken, "names that no index of n has")
+    brief = dataclasses.replace(grid, r_eff=(grid.r_eff or ())[:1], magnitude=(grid.magnitude or ())[:1])
+    if grid.n:
+        return _free_points(dataclasses.replace(brief, n=grid.n[:1], hosts=None))
+    return _free_points(dataclasses.replace(brief, hosts=(grid.hosts or ())[:1]))
+
+
+def _axes(grid: Grid) -> tuple[Sequence[Any], ...]:
+    """The lists of a free grid, every combination of which is run."""
+    shapes = (*(HostShape(n=index) for index in grid.n or ()), *(grid.hosts or ()))
+    return (
+        grid.systems or (), grid.l_eta or (), grid.r_eff or (), shapes, grid.magnitude or (), grid.deflectors or (None,)
+    )  # fmt: skip
 
 
 def _free_points(grid: Grid) -> Iterator[_Point]:
-    axes = (grid.systems or (), grid.l_eta or (), grid.r_eff or (), grid.n or (), grid.magnitude or ())
-    for system, slope, radius, index, brightness in product(*axes):
-        yield system, None, Host(n=index, r_eff=radius, magnitude=brightness), slope
+    for system, slope, radius, shape, brightness, deflector in product(*_axes(grid)):
+        # One that has nothing is none: the same realization as without.
+        more = None if deflector is None or deflector.is_plain else deflector
+        yield _Point(system, None, Host.of(shape, radius, brightness), slope, more)
+
+
+def _entry(value: object) -> object:
+    """What entries of a list are told apart by."""
+    return (
+        value.label
+        if isinstance(value, HostShape | Deflector)
+        else value.name
+        if isinstance(value, LensSystem)
+        else value
+    )
 
 
 def _name(system: str | LensSystem) -> str:

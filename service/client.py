@@ -17,6 +17,7 @@ from service.domain.answers import ComparisonAnswer, FrontierAnswer, ResultPage,
 from service.domain.prediction_views import PredictionAnswer
 from service.domain.views import (
     DryRun,
+    EngineView,
     EventPage,
     GridPage,
     GridView,
@@ -241,6 +242,10 @@ class Client:
 
         return as_frame(*self._whole(grid_ids, asked))
 
+    def export(self, kind: str, *grid_ids: str, **asked: Filter) -> bytes:
+        """The same rows as a file: csv, ecsv, parquet, vot or fits; ``specs="true"`` adds what is needed to replay."""
+        return self._connection.file(_address(f"/v1/results.{_part(kind)}", grid_ids, asked))
+
     def figure(self, grid_id: str | None, name: str = "bias", kind: str = "svg", **asked: Filter) -> bytes:
         """A figure as an SVG or PNG file: bias, sample, coverage, pull, trends, and of a grid montage.
 
@@ -302,6 +307,10 @@ class Client:
             only = {name: _texts(values) for name, values in where.items()}
             body = {"content": as_json(only), "headers": {"Content-Type": "application/json"}}
         return self._connection.call(RetriedGrid, "POST", f"/v1/grids/{_part(grid_id)}/retry", **body)
+
+    def engine(self) -> EngineView:
+        """Which engine the service carries."""
+        return self._connection.call(EngineView, "GET", "/v1/engine")
 
     def readiness(self) -> Readiness:
         """Whether the service can compute."""

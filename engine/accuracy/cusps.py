@@ -64,10 +64,10 @@ class _Field:
     def light(self, cells: CuspGrid | None) -> FloatArray:
         """Flux per sub-pixel, with or without its cusps placed."""
         scene, geometry = self.subject.scene, self.geometry
-        light = render_sersic(scene.host, *geometry.high_resolution_axes(), geometry.subpixel_scale, scene.lens)
+        light = render_sersic(scene.host_profile, *geometry.high_resolution_axes(), geometry.subpixel_scale, scene.lens)
         if cells is None:
             return light
-        return place_cusps(light, scene.host, self.subject.cusps, geometry, scene.lens, cells)
+        return place_cusps(light, scene.host_profile, self.subject.cusps, geometry, scene.lens, cells)
 
     def image(self, light: FloatArray) -> FloatArray:
         """Noiseless exposures of it."""

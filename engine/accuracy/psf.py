@@ -67,8 +67,8 @@ class _Lights:
         self.geometry = geometry = subject.small_geometry()
         self.kernel = detector_kernel(scene.camera)
         x, y = geometry.high_resolution_axes()
-        light = render_sersic(scene.host, x, y, geometry.subpixel_scale, scene.lens)
-        self.extended = place_cusps(light, scene.host, subject.cusps, geometry, scene.lens)
+        light = render_sersic(scene.host_profile, x, y, geometry.subpixel_scale, scene.lens)
+        self.extended = place_cusps(light, scene.host_profile, subject.cusps, geometry, scene.lens)
         if scene.deflector is not None:
             light = render_sersic(scene.deflector, x, y, geometry.subpixel_scale)
             centre = [(scene.deflector.x, scene.deflector.y)]

@@ -63,7 +63,7 @@ class HostImage:
 
     def __init__(self, subject: Subject) -> None:
         scene, self.geometry, self.subject = subject.scene, subject.small_geometry(), subject
-        self.host, self.lens, self.scale = scene.host, scene.lens, self.geometry.subpixel_scale
+        self.host, self.lens, self.scale = scene.host_profile, scene.lens, self.geometry.subpixel_scale
         self.x, self.y = self.geometry.high_resolution_axes()
         self._psf = optical_psf(scene.camera, self.geometry.oversampling)
         self._other, self._exact = (

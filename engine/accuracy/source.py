@@ -79,7 +79,7 @@ def with_data(likelihood: MarginalLikelihood, data: FloatArray) -> MarginalLikel
 
 def clump(subject: Subject) -> FloatArray:
     """Drizzled image (ny, nx) of a clump beside the host's centre, along the host's major axis."""
-    host = subject.scene.host
+    host = subject.scene.host_profile
     away = _CLUMP_PLACE * host.r_eff
     profile = replace(
         host,

@@ -25,8 +25,8 @@ from engine.posterior.start import find_start, prepare_target
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.simulate import Simulation, scene_geometry, simulate_realization
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 INDEX = 4.0
 """The concentrated host of the paper's grid: the cusp is what pixels find hardest."""
@@ -86,7 +86,7 @@ class Subject:
     @cached_property
     def cusps(self) -> list[tuple[float, float]]:
         """Image positions [arcsec] of the host's centre."""
-        return cusp_positions(self.scene.host, self.scene.lens, self.geometry)
+        return cusp_positions(self.scene.host_profile, self.scene.lens, self.geometry)
 
     @property
     def reach(self) -> float:

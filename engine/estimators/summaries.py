@@ -12,11 +12,11 @@ from engine.conventions import FloatArray, position_angle, rate_to_magnitude
 from engine.estimators.aperture import RADIUS, aperture_flux
 from engine.estimators.draws import SourceDraw
 from engine.estimators.sersic_fit import Refit
-from engine.light.sersic import SersicProfile
+from engine.light.galaxy import Light
 from engine.result import Aperture, Estimate, Quantity
 
 
-def galfit_radius(profile: SersicProfile) -> float:
+def galfit_radius(profile: Light) -> float:
     """Half-light radius on the major axis [arcsec], GALFIT's convention, from ours on the intermediate axis."""
     return profile.r_eff / math.sqrt(profile.q)
 

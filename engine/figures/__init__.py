@@ -3,6 +3,7 @@
 from engine.figures.accuracy import accuracy_figure
 from engine.figures.biases import bias_figure
 from engine.figures.calibration import coverage_figure, pull_figure
+from engine.figures.hosts import hosts_figure
 from engine.figures.inversion import inversion_figure
 from engine.figures.measurement import measurement_figure
 from engine.figures.output import FIGURE_FORMATS, FigureFormat, figure_bytes
@@ -26,6 +27,7 @@ __all__ = [
     "figure_bytes",
     "gallery_figure",
     "grid_figure",
+    "hosts_figure",
     "inversion_figure",
     "measurement_figure",
     "montage_figure",

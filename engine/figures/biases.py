@@ -48,6 +48,8 @@ _PRIOR_FILLS: dict[IndexPrior, Literal["full", "left"]] = {"wide": "full", "free
 _SLOT = 0.8
 _PANEL_WIDTH, _PANEL_HEIGHT = 4.4, 2.75
 _MOST_LISTED = 24
+_WIDE = 6
+"""Letters from which on the name of a host is written small."""
 _LISTED_AN_INCH, _BLOCK_HEIGHT = 2.4, 0.72
 
 
@@ -141,8 +143,8 @@ def _serial_panel(
     priors: dict[IndexPrior, str],
     limits: Limits,
 ) -> None:
-    # An index that is fixed to the truth has no bias to show.
-    shown = [p for p in points if quantity != "n" or p.index_prior != "fixed"]
+    # An index that is fixed to the truth has no bias to show, and one of a host that has none has no truth.
+    shown = [p for p in points if p.has_truth(quantity) and (quantity != "n" or p.index_prior != "fixed")]
     axes.set_xlim(0.5, len(numbers) + 0.5)
     axes.set_xlabel("serial number of the configuration", fontsize=9)
     axes.set_ylabel(AXIS_LABELS[quantity], fontsize=9)
@@ -154,7 +156,9 @@ def _serial_panel(
     for number in range(2, len(numbers) + 1):
         axes.axvline(number - 0.5, color="0.75", linewidth=0.4, zorder=0.3)
     if not shown:
-        axes.text(0.5, 0.5, "no run with n free", transform=axes.transAxes, ha="center", va="bottom", fontsize=9)
+        axes.text(
+            0.5, 0.5, "no run with n free and a truth", transform=axes.transAxes, ha="center", va="bottom", fontsize=9
+        )
         return
     means = _means(shown, quantity)
     limit_biases(axes, quantity, [m.bias for m in means], [m.error for m in means], limits)
@@ -243,11 +247,12 @@ def _list_numbers(axes: Axes, numbers: dict[Setting, int], blocks: int) -> None:
             axes.text(-0.2 * in_block, block * step + row + 0.5, name, fontsize=8.5, ha="left", va="center")
     for setting, number in numbers.items():
         block, column = divmod(number - 1, in_block)
-        cells = (f"{number}", f"{setting.n:g}", f"{setting.r_eff:g}", f"{setting.l_eta:g}")
+        index = setting.host if setting.n is None else f"{setting.n:g}"
+        cells = (f"{number}", index, f"{setting.r_eff:g}", f"{setting.l_eta:g}")
         for row, cell in enumerate(cells):
             axes.text(
-                column + 0.5, block * step + row + 0.5, cell, fontsize=8.5, ha="center", va="center",
-                fontweight="bold" if row == 0 else "normal", gid=f"serial-{number}-{row}",
+                column + 0.5, block * step + row + 0.5, cell, fontsize=8.5 if len(cell) < _WIDE else 5.0, ha="center",
+                va="center", fontweight="bold" if row == 0 else "normal", gid=f"serial-{number}-{row}",
             )  # fmt: skip
 
 

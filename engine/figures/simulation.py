@@ -64,11 +64,17 @@ def simulation_figure(simulation: Simulation) -> Figure:
     host = scene.host
     figure.suptitle(
         f"{scene.system.name}, {scene.camera.name}: host {record.get('HOST_MAG', '')} mag, "
-        f"$R_{{eff}}$ {host.r_eff:g}″, $n$ {host.n:g}, $l_\\eta$ {scene.lens.slope - 1:.1f}, "
+        f"$R_{{eff}}$ {host.r_eff:g}″, {_shape(simulation)}, $l_\\eta$ {scene.lens.slope - 1:.1f}, "
         f"noise level {simulation.exposures.noise.level}",
         fontsize=11,
     )
     return figure
+
+
+def _shape(simulation: Simulation) -> str:
+    """What the host is: its index, or its name."""
+    n = simulation.scene.host.n
+    return f"{simulation.observation.provenance.get('HOST', 'no profile')}" if n is None else f"$n$ {n:g}"
 
 
 def _others(simulation: Simulation) -> str:
@@ -152,9 +158,9 @@ def gallery_figure(simulations: Sequence[Simulation]) -> Figure:
         scale_bar(left, half)
         compass(right, half)
     colour_bar(figure, shown, list(axes.flat), norm, "units of the empty-sky noise, asinh stretch, one for all panels")
-    host, lens = simulations[0].scene.host, simulations[0].scene.lens
+    first, lens = simulations[0], simulations[0].scene.lens
     figure.suptitle(
-        f"Drizzled simulations ($n$ {host.n:g}, $l_\\eta$ {lens.slope - 1:.1f}); "
+        f"Drizzled simulations ({_shape(first)}, $l_\\eta$ {lens.slope - 1:.1f}); "
         "right of each: its lensed host without noise",
         fontsize=11,
     )

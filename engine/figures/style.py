@@ -230,7 +230,7 @@ def in_order(points: Iterable[BiasPoint]) -> list[BiasPoint]:
     """
     ordered = sorted(
         points,
-        key=lambda p: (p.system, p.magnitude, p.setting, p.estimator, p.index_prior, p.seed, p.run_id),
+        key=lambda p: (p.system, p.magnitude, p.setting.order(), p.estimator, p.index_prior, p.seed, p.run_id),
     )
     if not ordered:
         raise NothingToShowError("points: got none, allowed is at least one result")

@@ -16,6 +16,7 @@ import numpy as np
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import LensEquationError
+from engine.lensing.perturbers import Multipole
 from engine.lensing.power_law import (
     LensConstants,
     PowerLawLens,
@@ -96,7 +97,14 @@ def _polish(x: float, y: float, sx: float, sy: float, lens: LensConstants) -> tu
 def _is_coarse(x: float, y: float, side: float, theta_E: float, lens: LensConstants) -> bool:
     """Whether a cell is large against its distance from the lens, on whose scale the deflection varies."""
     distance = max(math.hypot(x - lens.x, y - lens.y) - 0.71 * side, _CORE * theta_E)
-    return side > _COARSE * math.sqrt(lens.q) * distance
+    coarse = side > _COARSE * math.sqrt(lens.q) * distance
+    # A satellite's own scale is its Einstein radius, beside which it is as a lens.
+    for k in range(lens.perturbers.shape[0]):
+        size = lens.perturbers[k, 3]
+        if lens.perturbers[k, 0] == 1.0 and not coarse:
+            off = max(math.hypot(x - lens.perturbers[k, 1], y - lens.perturbers[k, 2]) - 0.71 * side, _CORE * size)
+            coarse = off < 3.0 * size and side > _COARSE * math.sqrt(lens.perturbers[k, 6]) * off
+    return coarse
 
 
 @kernel
@@ -232,7 +240,19 @@ def _images(
 def makes_ring(lens: PowerLawLens, source_x: float, source_y: float) -> bool:
     """Whether a point is seen as a ring, of radius theta_E round the lens: behind the middle of one that is round."""
     near = math.hypot(source_x - lens.x, source_y - lens.y) <= _RING * lens.theta_E
-    return near and lens.q >= 1.0 - _RING and math.hypot(lens.gamma1, lens.gamma2) <= _RING
+    alone = not lens.perturbers and math.hypot(lens.gamma1, lens.gamma2) <= _RING
+    return near and lens.q >= 1.0 - _RING and alone
+
+
+def _perturbing(lens: PowerLawLens) -> tuple[float, float]:
+    """By what factor multipoles at most raise the power law's deflection, and what satellites at most add [arcsec]."""
+    t, factor, more = lens.slope - 1.0, 1.0, 0.0
+    for one in lens.perturbers:
+        if isinstance(one, Multipole):
+            factor += (2.0 - t) * t * abs(one.amplitude) * one.m / abs((2.0 - t) ** 2 - one.m**2)
+        else:
+            more += one.theta_E / math.sqrt(one.q)
+    return factor, more
 
 
 def solve_lens_equation(
@@ -265,8 +285,9 @@ def solve_lens_equation(
         raise LensEquationError(f"shear: got {shear}, allowed is below 1")
     # |alpha| <= theta_E q^(-1/2) (r / theta_E)^(2 - slope) bounds how far out an image can lie.
     reach = lens.theta_E / math.sqrt(lens.q)
+    steep, more = _perturbing(lens)
     half = 1.0 * reach
-    while half * (1.0 - shear) - offset - reach * (half / lens.theta_E) ** (2.0 - lens.slope) < 0.0:
+    while half * (1.0 - shear) - offset - more - steep * reach * (half / lens.theta_E) ** (2.0 - lens.slope) < 0.0:
         half *= 1.3
         if half > 1e4 * reach + 10.0 * offset:
             raise LensEquationError(f"slope {lens.slope} and shear {shear} leave the image plane unbounded")

@@ -14,7 +14,7 @@ below |a_K| f / (1 - f), and the count is chosen to bring that bound below round
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ import numpy as np
 from engine.compiled import inlined_kernel, kernel
 from engine.conventions import FloatArray
 from engine.errors import SpecError
+from engine.lensing.perturbers import Perturber, perturb_jacobian, perturb_point, perturber_rows
 
 SERIES_TOLERANCE = 1e-16
 _BLOCK = 64
@@ -43,6 +44,8 @@ class PowerLawLens:
         Centre [arcsec].
     gamma1, gamma2 : float
         External shear about the origin of the frame.
+    perturbers : tuple
+        Multipoles of the power law, and satellites (:mod:`engine.lensing.perturbers`).
     """
 
     theta_E: float
@@ -53,6 +56,7 @@ class PowerLawLens:
     y: float = 0.0
     gamma1: float = 0.0
     gamma2: float = 0.0
+    perturbers: tuple[Perturber, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse what the formulas do not cover."""
@@ -66,9 +70,14 @@ class PowerLawLens:
         if not all(map(math.isfinite, values)):
             raise SpecError("lens", values, "finite angle, centre and shear")
 
+    @property
+    def sheared(self) -> bool:
+        """Whether there is an external shear."""
+        return self.gamma1 != 0.0 or self.gamma2 != 0.0
+
     def with_values(self, **values: float) -> PowerLawLens:
         """A copy with some parameters replaced."""
-        return replace(self, **values)
+        return replace(self, **values)  # type: ignore[arg-type]  # none of them is the perturbers
 
 
 def series_coefficients(q: float, t: float, tolerance: float = SERIES_TOLERANCE) -> FloatArray:
@@ -85,7 +94,8 @@ class LensConstants(NamedTuple):
     """A lens as the compiled kernels take it.
 
     ``b`` is theta_E sqrt(q) [arcsec], (``cos``, ``sin``) those of phi, ``t`` is slope - 1, ``x`` and ``y`` the centre
-    [arcsec], ``gamma1`` and ``gamma2`` the shear, ``series`` (k,) the coefficients of the deflection.
+    [arcsec], ``gamma1`` and ``gamma2`` the shear, ``series`` (k,) the coefficients of the deflection,
+    ``perturbers`` (p, 8) the rows of :func:`engine.lensing.perturbers.perturber_rows`.
     """
 
     b: float
@@ -98,6 +108,7 @@ class LensConstants(NamedTuple):
     gamma1: float
     gamma2: float
     series: FloatArray
+    perturbers: FloatArray
 
 
 def lens_constants(lens: PowerLawLens) -> LensConstants:
@@ -115,6 +126,7 @@ def lens_constants(lens: PowerLawLens) -> LensConstants:
         gamma1=float(lens.gamma1),
         gamma2=float(lens.gamma2),
         series=series_coefficients(lens.q, t),
+        perturbers=perturber_rows(lens.perturbers, lens.theta_E, t, lens.x, lens.y),
     )
 
 
@@ -131,6 +143,10 @@ def deflect_point(x: float, y: float, lens: LensConstants) -> tuple[float, float
     r2 = u * u + v * v
     shear_x = lens.gamma1 * x + lens.gamma2 * y
     shear_y = lens.gamma2 * x - lens.gamma1 * y
+    if lens.perturbers.shape[0]:
+        more_x, more_y = perturb_point(x, y, lens.perturbers)
+        shear_x += more_x
+        shear_y += more_y
     if r2 == 0.0:
         return shear_x, shear_y
     r = math.sqrt(r2)
@@ -199,6 +215,11 @@ def _map_rays(x: FloatArray, y: FloatArray, lens: LensConstants, bx: FloatArray,
             alpha_y = s * ar + c * ai + lens.gamma2 * xi - lens.gamma1 * yi
             bx[start + i] = xi - alpha_x if traced else alpha_x
             by[start + i] = yi - alpha_y if traced else alpha_y
+    if lens.perturbers.shape[0]:
+        for i in range(x.size):
+            more_x, more_y = perturb_point(x[i], y[i], lens.perturbers)
+            bx[i] += -more_x if traced else more_x
+            by[i] += -more_y if traced else more_y
 
 
 @kernel
@@ -223,11 +244,19 @@ def jacobian_point(x: float, y: float, lens: LensConstants) -> tuple[float, floa
     """
     b, q, c, s, t = lens.b, lens.q, lens.cos, lens.sin, lens.t
     dx, dy = x - lens.x, y - lens.y
+    more, more1, more2 = 0.0, lens.gamma1, lens.gamma2
     if dx == 0.0 and dy == 0.0:
-        return np.inf, lens.gamma1, lens.gamma2
+        return np.inf, more1, more2
     ax, ay = deflect_point(x, y, lens)
     ax -= lens.gamma1 * x + lens.gamma2 * y
     ay -= lens.gamma2 * x - lens.gamma1 * y
+    if lens.perturbers.shape[0]:
+        more_x, more_y = perturb_point(x, y, lens.perturbers)
+        ax -= more_x
+        ay -= more_y
+        more, extra1, extra2 = perturb_jacobian(x, y, lens.perturbers)
+        more1 += extra1
+        more2 += extra2
     u = q * (c * dx + s * dy)
     v = c * dy - s * dx
     kappa = 0.5 * (2.0 - t) * (b / math.sqrt(u * u + v * v)) ** t
@@ -235,7 +264,7 @@ def jacobian_point(x: float, y: float, lens: LensConstants) -> tuple[float, floa
     # gamma = [(1 - t) alpha - z kappa] / z*  =  [(1 - t) alpha - z kappa] z / |z|^2
     re = (1.0 - t) * ax - dx * kappa
     im = (1.0 - t) * ay - dy * kappa
-    return kappa, (re * dx - im * dy) / r2 + lens.gamma1, (re * dy + im * dx) / r2 + lens.gamma2
+    return kappa + more, (re * dx - im * dy) / r2 + more1, (re * dy + im * dx) / r2 + more2
 
 
 @kernel

@@ -14,6 +14,7 @@ import numpy as np
 
 from engine.compiled import inlined_kernel
 from engine.conventions import FloatArray
+from engine.errors import SpecError
 from engine.lensing.power_law import PowerLawLens
 
 LENS_DERIVATIVES = 6
@@ -55,6 +56,8 @@ class RayConstants(NamedTuple):
 
 def ray_constants(lens: PowerLawLens) -> RayConstants:
     """The constants of a lens; a round one is taken for one that is next to round."""
+    if lens.perturbers:
+        raise SpecError("perturbers", lens.perturbers, "none in a lens that is fitted")
     q, t = min(lens.q, (1.0 - _ROUND) / (1.0 + _ROUND)), float(lens.slope - 1.0)
     f = (1.0 - q) / (1.0 + q)
     q_by_f = -2.0 / (1.0 + f) ** 2

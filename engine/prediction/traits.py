@@ -13,7 +13,7 @@ from engine.catalogue import resolve_camera, resolve_dither, resolve_system
 from engine.conventions import FloatArray, pixel_centres, rate_to_magnitude
 from engine.errors import SpecError
 from engine.imaging.noise import exposure_noise
-from engine.light.rendering import render_sersic
+from engine.light.galaxy import render_light
 from engine.simulation.scene import build_scene
 from engine.spec.instrument import NOMINAL_OPTICS, Camera, Dither, ExposurePlan, NoiseLevel
 from engine.spec.realization import Realization
@@ -103,6 +103,8 @@ def traits_of(realization: Realization, arc_magnitude: float | None = None) -> L
         The realization asks for something that is not there.
     """
     system, camera, host = resolve_system(realization), resolve_camera(realization), realization.host
+    if host.n is None:
+        raise SpecError("host", host.label, "a Sersic profile: predictions go by its index n")
     optics = realization.optics or NOMINAL_OPTICS
     arc = lensed_magnitude(realization) if arc_magnitude is None else arc_magnitude
     light = sum(10.0 ** (-0.4 * image.magnitude) for image in system.agn)
@@ -129,7 +131,7 @@ def lensed_magnitude(realization: Realization) -> float:
     reach = 0.5 * scene.system.exposures.field_pixels * scene.camera.drizzled_scale
     cells = math.ceil(2.0 * reach / scene.camera.pixel_scale)
     axis = pixel_centres(cells, scene.camera.pixel_scale)
-    light = render_sersic(scene.host, axis, axis, scene.camera.pixel_scale, scene.lens)
+    light = render_light(scene.host, axis, axis, scene.camera.pixel_scale, scene.lens)
     return rate_to_magnitude(float(light.sum()), scene.camera.zero_point)
 
 

@@ -27,9 +27,10 @@ from engine.imaging.observation import Observation, Provenance
 from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel
 from engine.imaging.telescope import known_psf, optical_psf
-from engine.light.rendering import render_sersic
+from engine.light.galaxy import profiles_of, render_light
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.seeds import sky_generator
+from engine.spec.deflector import USUAL_DEFLECTOR
 from engine.spec.instrument import Camera, NoiseLevel
 from engine.spec.realization import Realization
 
@@ -86,13 +87,14 @@ def image_psf(camera: Camera, geometry: Geometry, coarse: int = 1) -> FloatArray
 def high_resolution_host(scene: Scene, geometry: Geometry) -> FloatArray:
     """The lensed host on the high-resolution grid before the PSF [e-/s per sub-pixel]."""
     x, y = geometry.high_resolution_axes()
-    return render_sersic(scene.host, x, y, geometry.subpixel_scale, scene.lens)
+    return render_light(scene.host, x, y, geometry.subpixel_scale, scene.lens)
 
 
 def blurred_host(scene: Scene, geometry: Geometry, host: FloatArray) -> FloatArray:
     """The lensed host after the PSF, on the high-resolution grid."""
-    cusps = cusp_positions(scene.host, scene.lens, geometry)
-    placed = place_cusps(host, scene.host, cusps, geometry, scene.lens)
+    placed = host
+    for profile in profiles_of(scene.host):
+        placed = place_cusps(placed, profile, cusp_positions(profile, scene.lens, geometry), geometry, scene.lens)
     return convolve(placed, optical_psf(scene.camera, geometry.oversampling, scene.optics))
 
 
@@ -100,11 +102,11 @@ def high_resolution_image(scene: Scene, geometry: Geometry, arc: FloatArray) -> 
     """Blurred host (``arc``), deflector and AGN on the high-resolution grid; what the scene lacks is not computed."""
     psf = optical_psf(scene.camera, geometry.oversampling, scene.optics)
     image = arc
-    if scene.deflector is not None:
+    for profile in () if scene.deflector is None else (scene.deflector, *scene.deflector_more):
         x, y = geometry.high_resolution_axes()
-        light = render_sersic(scene.deflector, x, y, geometry.subpixel_scale)
-        cusps = cusp_positions(scene.deflector, None, geometry)
-        image = image + convolve(place_cusps(light, scene.deflector, cusps, geometry), psf)
+        light = render_light(profile, x, y, geometry.subpixel_scale)
+        cusps = cusp_positions(profile, None, geometry)
+        image = image + convolve(place_cusps(light, profile, cusps, geometry), psf)
     if scene.agn:
         positions = np.array([(source.x, source.y) for source in scene.agn])
         fluxes = np.array([source.flux for source in scene.agn])
@@ -220,13 +222,15 @@ def simulate_realization(realization: Realization) -> Simulation:
 
 def realization_record(scene: Scene, realization: Realization) -> dict[str, str | float | int]:
     """What was asked for and by what it was computed, as the provenance of an observation has it."""
-    host = scene.host
+    host, deflector = scene.host, realization.deflector
     return {
         "MASSMOD": realization.mass_model,
         "L_ETA": realization.l_eta,
         "HOST_MAG": realization.host.magnitude,
         "HOST_RE": host.r_eff,
-        "HOST_N": host.n,
+        **({} if host.n is None else {"HOST_N": host.n}),
+        "HOST": realization.host.label,
+        "DEFLECT": USUAL_DEFLECTOR if deflector is None else deflector.label,
         "HOST_Q": host.q,
         "HOST_PA": position_angle(host.phi),
         "SEED": realization.seed,

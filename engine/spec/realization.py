@@ -11,9 +11,11 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from engine.spec.analysis import ESTIMATORS, Analysis
+from engine.spec.deflector import Deflector
+from engine.spec.host import Host
 from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
 from engine.spec.quantities import STRICT, Identifier, Seed, Slope
-from engine.spec.sky import Host, LensSystem, SystemChoice
+from engine.spec.sky import LensSystem, SystemChoice
 from engine.spec.validation import spec_error
 
 _Read = TypeVar("_Read")
@@ -24,7 +26,8 @@ class Realization:
     """One run of the study: a system at one slope, a host, a noise level, a study seed and how it is analysed.
 
     ``system`` names a catalogue entry or is a :class:`LensSystem` of the user's own; ``camera`` likewise, and is the
-    system's own where None. ``optics`` spoils the PSF of the simulation, not the one that the analysis is given.
+    system's own where None. ``deflector`` is what the lens has beside light and mass of the system. ``optics`` spoils
+    the PSF of the simulation, not the one that the analysis is given.
     Equal realizations have equal digests and give the same bits.
     """
 
@@ -36,6 +39,7 @@ class Realization:
     mass_model: Identifier = "recommended"
     camera: CameraChoice | None = None
     optics: Optics | None = None
+    deflector: Deflector | None = None
     analysis: Analysis = Field(default_factory=Analysis)
 
     def to_dict(self) -> dict[str, Any]:
@@ -44,8 +48,10 @@ class Realization:
         if not isinstance(dumped, dict):  # pragma: no cover - a dataclass always dumps to a mapping
             raise TypeError(type(dumped))
         # Left out where it is not used, so that realizations from before there was such a field keep their digests.
-        if dumped["optics"] is None:
-            del dumped["optics"]
+        for holder, names in ((dumped, ("optics", "deflector")), (dumped["host"], ("n", "image", "made", "name"))):
+            for name in names:
+                if holder[name] is None:
+                    del holder[name]
         dumped["analysis"] |= _GONE
         for name in ("agn_position_sd", "background_sd", "max_error"):
             if dumped["analysis"][name] is None:

@@ -1,4 +1,4 @@
-"""What stands in the sky: lens systems as they were observed, and the host that is put behind them."""
+"""What stands in the sky: lens systems as they were observed."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from engine.errors import SpecError
 from engine.spec.instrument import CameraChoice, ExposurePlan
+from engine.spec.light import SersicLight
 from engine.spec.priors import Priors
 from engine.spec.quantities import (
     STRICT,
@@ -19,8 +20,6 @@ from engine.spec.quantities import (
     Magnitude,
     Number,
     Position,
-    Radius,
-    SersicIndex,
     Shear,
     SlopeKey,
 )
@@ -47,18 +46,6 @@ class MassModel:
     source_position: Position
     centre: Position = (0.0, 0.0)
     shear: tuple[Shear, Shear] | None = None
-
-
-@dataclass(frozen=True, config=STRICT)
-class SersicLight:
-    """A Sersic profile: total AB magnitude, r_eff [arcsec, intermediate axis], index, axis ratio, position angle."""
-
-    magnitude: Magnitude
-    r_eff: Radius
-    n: SersicIndex
-    q: AxisRatio
-    position_angle: Angle
-    centre: Position = (0.0, 0.0)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -127,14 +114,3 @@ class LensSystem:
 SystemChoice = Annotated[
     Annotated[Identifier, Tag(NAME_TAG)] | Annotated[LensSystem, Tag(OBJECT_TAG)], Discriminator(name_or_object)
 ]
-
-
-@dataclass(frozen=True, config=STRICT)
-class Host:
-    """The host galaxy to be recovered. q and position angle [deg] are the system's where None."""
-
-    n: SersicIndex
-    r_eff: Radius
-    magnitude: Magnitude
-    q: AxisRatio | None = None
-    position_angle: Angle | None = None

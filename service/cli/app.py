@@ -22,6 +22,7 @@ from service.cli.frontier import frontier
 from service.cli.measuring import measure
 from service.cli.predict import predict
 from service.cli.replay import replay
+from service.cli.study import study
 from service.cli.tokens import tokens
 from service.runtime.start import CONFIGURATION, ConfigurationError
 
@@ -70,7 +71,7 @@ database = typer.Typer(no_args_is_help=True, help="The database.")
 app.add_typer(database, name="db")
 app.add_typer(tokens, name="token")
 for command in (
-    *grids.COMMANDS, *pictures.COMMANDS, frontier, predict, figures, accuracy, measure, compare_codes, replay,
+    *grids.COMMANDS, *pictures.COMMANDS, frontier, predict, figures, accuracy, measure, compare_codes, replay, study,
 ):  # fmt: skip
     app.command()(command)
 

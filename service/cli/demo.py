@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from datetime import datetime
-from pathlib import Path
-from types import FrameType
 
 import httpx
 from rich.console import Console
 
 from service.cli.formatting import duration, summary_table
-from service.cli.watch import Show, progress
+from service.cli.own_service import StoppedError, own_service, wait_until_ready
+from service.cli.watch import progress
 from service.client import Client, ClientError
 from service.domain.views import GridView
-from service.runtime import preflight
-from service.runtime.installation import DidNotHappenError, Installation, eventually, free_port
+from service.runtime.installation import DidNotHappenError
 from service.runtime.settings import Settings
-from service.runtime.start import STOPS
-from service.runtime.supervisor import as_environment
 from service.store.artefacts import ArtefactStore
 
 REQUEST = {
@@ -35,7 +26,6 @@ REQUEST = {
     "l_eta": [1.0],
     "r_eff": [0.39],
 }
-_READY_S = 120.0
 
 
 def demo(settings: Settings, console: Console, timeout_s: float = 3600.0) -> int:
@@ -46,23 +36,21 @@ def demo(settings: Settings, console: Console, timeout_s: float = 3600.0) -> int
     """
     began = time.monotonic()
     folder = settings.data_dir.absolute() / f"demo-{datetime.now().astimezone():%Y%m%d-%H%M%S}-{os.getpid()}"
-    own = {"data_dir": folder, "database_url": None, "artefact_url": None, "host": "127.0.0.1"}
+    own = {"data_dir": folder, "database_url": None, "artefact_url": None}
     settings = settings.model_copy(update=own)
-    preflight.require_data(settings)
-    with _running(folder, settings) as (service, stop):
+    with own_service(settings) as (service, stop):
         client = service.client
         said = f"API, dispatcher and {settings.workers} workers; data in {folder}"
         console.print(said, highlight=False, soft_wrap=True)
         try:
-            eventually(lambda: stop.is_set() or service.is_ready(), _READY_S, "readiness")
-            stop.require_unset()
+            wait_until_ready(service, stop)
             console.print(f"ready after {duration(time.monotonic() - began)}: http://127.0.0.1:{service.port}")
             grid = client.submit(REQUEST)
             console.print(f"submitted {grid.id}: {grid.n_runs} runs", highlight=False)
             with progress(console) as show:
-                grid = client.wait(grid.id, _until(stop, show), timeout_s=timeout_s)
+                grid = client.wait(grid.id, stop.until(show), timeout_s=timeout_s)
             _report(console, client, settings, grid)
-        except (ClientError, httpx.RequestError, TimeoutError, DidNotHappenError, _StoppedError) as error:
+        except (ClientError, httpx.RequestError, TimeoutError, DidNotHappenError, StoppedError) as error:
             console.print(f"the demo ends early: {error}", markup=False, soft_wrap=True)
             return 128 + stop.number if stop.number else 1
     console.print(f"wall time {duration(time.monotonic() - began)}; all processes have ended")
@@ -79,49 +67,3 @@ def _report(console: Console, client: Client, settings: Settings, grid: GridView
         else:
             where = f"{run.state}" + (f", {run.error.code}: {run.error.detail}" if run.error else "")
         console.print(f"figure of {run.label}: {where}", markup=False, highlight=False, soft_wrap=True)
-
-
-class _StoppedError(RuntimeError):
-    """Someone pressed Ctrl-C."""
-
-
-class _Wanted(threading.Event):
-    """Set by the signal ``number``."""
-
-    number = 0
-
-    def by_signal(self, number: int, _frame: FrameType | None) -> None:
-        """Handle it."""
-        self.number = number
-        self.set()
-
-    def require_unset(self) -> None:
-        """Go no further once it is set."""
-        if self.is_set():
-            raise _StoppedError("interrupted")
-
-
-def _until(stop: _Wanted, show: Show) -> Show:
-    def shown(grid: GridView) -> None:
-        show(grid)
-        stop.require_unset()
-
-    return shown
-
-
-@contextmanager
-def _running(folder: Path, settings: Settings) -> Iterator[tuple[Installation, _Wanted]]:
-    """The supervised service for as long as the context lasts; the event is set when the user wants to stop."""
-    variables = as_environment(settings.model_copy(update={"port": free_port()}))
-    wanted = _Wanted()
-    before = {number: signal.signal(number, wanted.by_signal) for number in STOPS}
-    unset = [name for name in os.environ if name.startswith("HOSTLENS_")]
-    service = Installation(folder, variables, without=unset)
-    try:
-        yield service, wanted
-    finally:
-        with suppress(subprocess.TimeoutExpired):
-            service.end(signal.SIGTERM)
-        service.kill_all()
-        for number, handler in before.items():
-            signal.signal(number, handler)

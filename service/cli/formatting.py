@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -18,6 +19,10 @@ from service.domain.views import (
     SummaryValue,
 )
 
+if TYPE_CHECKING:
+    from engine import Conclusion
+
+_USUAL = ("sersic", "plain")
 _INPUT = (("l_eta", "l_eta"), ("n", "n"), ("r_eff", "R_eff"), ("magnitude", "mag"))
 ROWS: tuple[tuple[EstimateName, str, str], ...] = (
     ("image_wide", "magnitude", "magnitude"),
@@ -54,7 +59,8 @@ def summary_table(summary: Summary) -> Table:
         table.add_column(title, justify="right", no_wrap=True)
     for row in summary.rows:
         named = [f"{row.input['system']} ({row.n_runs} run{'s' * (row.n_runs > 1)})"]
-        named += [f"{title} = {row.input[name]:g}" for name, title in _INPUT]
+        named += [f"{title} = {row.input[name]:g}" for name, title in _INPUT if row.input[name] is not None]
+        named += [f"{name} {row.input[name]}" for name in ("host_label", "deflector") if row.input[name] not in _USUAL]
         named += [""] * (len(ROWS) - len(named))
         for place, (cell, (estimate, quantity, title)) in enumerate(zip(named, ROWS, strict=True)):
             last = place == len(ROWS) - 1
@@ -69,6 +75,17 @@ def summary_table(summary: Summary) -> Table:
         "bias: recovered minus true; sd: spread of the draws of a run; by the image estimator where none is named; "
         "n in 1-4 for paper"
     )
+    return table
+
+
+def conclusions_table(found: Iterable[Conclusion]) -> Table:
+    """The paper's conclusions, and whether a study bears them out."""
+    from engine import verdict  # noqa: PLC0415 - only here
+
+    table = Table("section", "the paper says", "with paper", "with image", title="The paper's conclusions")
+    for one in found:
+        cells = [f"{verdict(finding)}: {finding.told}" for finding in (one.paper, one.recommended)]
+        table.add_row(one.statement.section, one.statement.says, *cells, end_section=True)
     return table
 
 

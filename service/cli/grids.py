@@ -13,6 +13,7 @@ import typer
 from service.cli.connection import Token, Url, connected, console
 from service.cli.outputs import as_file_name, require_folder
 from service.cli.request_file import named_or_read, read_request
+from service.cli.sky import DeflectorOption, HostImageOption, HostOption, deflectors_asked, hosts_asked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -54,9 +55,12 @@ def submit(
         list[str] | None, typer.Option(help="A name, or a TOML or JSON file; may be repeated, like the values below")
     ] = None,
     n: Floats = None,
+    host: HostOption = None,
+    host_image: HostImageOption = None,
     r_eff: Floats = None,
     magnitude: Floats = None,
     l_eta: Floats = None,
+    deflector: DeflectorOption = None,
     seed: Annotated[int | None, typer.Option(help="Of the first replicate; 0 without")] = None,
     replicates: Annotated[int | None, typer.Option(help="Seeds of each point; 1 without")] = None,
     until: Annotated[
@@ -102,7 +106,8 @@ def submit(
     request = {} if file is None else read_request(file, "--file")
     options = {
         "preset": preset, "systems": [named_or_read(entry, "--system") for entry in system or []],
-        "n": n, "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta, "seed": seed, "replicates": replicates,
+        "n": n, "hosts": hosts_asked(host, host_image), "r_eff": r_eff, "magnitude": magnitude, "l_eta": l_eta,
+        "deflectors": deflectors_asked(deflector), "seed": seed, "replicates": replicates,
         "camera": None if camera is None else named_or_read(camera, "--camera"),
         "mass_model": mass_model, "noise_level": noise_level, "name": name,
     }  # fmt: skip

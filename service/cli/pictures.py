@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.outputs import PICTURES, as_file_name, require_file, require_folder, require_kind, require_readable
+from service.cli.sky import DeflectorOption, HostImageOption, HostOption, deflectors_asked, hosts_asked
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,9 +34,12 @@ SeedOption = Annotated[int, typer.Option(min=0)]
 
 @dataclass(frozen=True)
 class HostOptions:
-    """The host and slope as the command line gives them; None where the catalogue has to say."""
+    """The host and slope as the command line gives them; None where the catalogue has to say.
 
-    n: float
+    ``shape`` is the index, or what the host is instead, as a specification has it.
+    """
+
+    shape: dict[str, Any]
     r_eff: float | None
     magnitude: float | None
     l_eta: float
@@ -44,9 +48,12 @@ class HostOptions:
 def simulate(
     system: Annotated[str, typer.Argument(help="A system of the catalogue, as HE0435, or a TOML or JSON file")],
     n: Annotated[float | None, typer.Option(help="Sersic index of the host; 2 where not given")] = None,
+    host: HostOption = None,
+    host_image: HostImageOption = None,
     r_eff: Annotated[float | None, typer.Option(help="arcsec; the paper's smaller one where not given")] = None,
     magnitude: Annotated[float | None, typer.Option(help="AB; the paper's second brightest where not given")] = None,
     l_eta: Annotated[float | None, typer.Option(help="Slope of the lens, gamma' - 1; 1 where not given")] = None,
+    deflector: DeflectorOption = None,
     seed: SeedOption = 0,
     noise_level: NoiseOption = "author",
     mass_model: MassOption = "recommended",
@@ -59,18 +66,23 @@ def simulate(
     """Simulate one realization. A FITS file, and a picture of its steps as in the paper's Fig. 1."""
     common = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
     if all_runs:
-        if any(value is not None for value in (n, r_eff, magnitude, l_eta)) or defocus_nm or jitter:
+        own = (n, host, host_image, r_eff, magnitude, l_eta, deflector)
+        if any(value is not None for value in own) or defocus_nm or jitter:
             raise typer.BadParameter("--all has the hosts, slopes and optics of the paper: leave out --n, --r-eff, ...")
         montage(system, **common, camera=camera, out=out)  # type: ignore[arg-type]
         return
     optics = {"defocus_nm": defocus_nm, "jitter": jitter} if defocus_nm or jitter else None
     _require_files(system, camera)
+    shapes, deflectors = hosts_asked(host, host_image), deflectors_asked(deflector)
+    if len(shapes) + (n is not None) > 1 or len(deflectors) > 1:
+        raise typer.BadParameter("one realization has one host and one deflector: of --n, --host and --host-image one")
+    shape = shapes[0] if shapes else {"n": _N if n is None else n}
     with refusals():
         realization = _realization(
             system,
-            HostOptions(_N if n is None else n, r_eff, magnitude, _L_ETA if l_eta is None else l_eta),
+            HostOptions(shape, r_eff, magnitude, _L_ETA if l_eta is None else l_eta),
             camera,
-            common | {"optics": optics},
+            common | {"optics": optics, "deflector": deflectors[0] if deflectors else None},
         )
         _write_one(realization, out)
 
@@ -149,7 +161,7 @@ def inversion(
     if out is not None:
         require_kind(out, PICTURES)
     with refusals():
-        realization = _realization(system, HostOptions(n, r_eff, magnitude, l_eta), camera, common)
+        realization = _realization(system, HostOptions({"n": n}, r_eff, magnitude, l_eta), camera, common)
         path = out or Path(f"{as_file_name(realization.system_name)}_inversion.png")
         require_folder(path.parent)
         require_file(path, PICTURES)
@@ -185,7 +197,7 @@ def _realization(system: str, host: HostOptions, camera: str | None, common: dic
     else:
         values = _paper_values(system) | {name: value for name, value in values.items() if value is not None}
     found = realization_from_dict(
-        {"system": chosen, "l_eta": host.l_eta, "host": {"n": host.n, **values}, "camera": _camera(camera), **common}
+        {"system": chosen, "l_eta": host.l_eta, "host": {**host.shape, **values}, "camera": _camera(camera), **common}
     )
     # Names that the catalogue does not have would be told by the simulation too, when all of it is loaded.
     lens = load_system(found.system) if isinstance(found.system, str) else found.system
@@ -232,8 +244,9 @@ def _validated(kind: Any, **fields: Any) -> Any:
 def _write_one(realization: Realization, out: Path) -> None:
     host = realization.host
     # The digest in the name: another seed or camera is another file, and the same command writes the same one again.
+    shape = as_file_name(host.label) if host.n is None else f"n{host.n:g}"
     stem = (
-        f"{as_file_name(realization.system_name)}_n{host.n:g}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
+        f"{as_file_name(realization.system_name)}_{shape}_r{host.r_eff:g}_m{host.magnitude:g}_l{realization.l_eta:g}"
         f"_{realization.digest[:8]}"
     )
     require_folder(out)

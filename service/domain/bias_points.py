@@ -9,7 +9,7 @@ from engine import BiasPoint, HostQuantity, Quantity
 
 _PLAIN = (
     "run_id", "system", "configuration", "n", "r_eff", "magnitude", "l_eta", "seed", "estimator", "index_prior",
-    "arc_magnitude", "agn_contrast", "surface_brightness",
+    "arc_magnitude", "agn_contrast", "surface_brightness", "host_kind", "host_label", "deflector",
 )  # fmt: skip
 
 

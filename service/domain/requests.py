@@ -17,12 +17,15 @@ import engine
 from engine import (
     NOMINAL_OPTICS,
     PRINTABLE,
+    USUAL_DEFLECTOR,
     Analysis,
     CameraChoice,
+    Deflectors,
     Expansion,
     FirstSeed,
     Grid,
     GridRun,
+    Hosts,
     Identifier,
     Indices,
     LensEquationError,
@@ -74,9 +77,10 @@ class GridRequest(BaseModel):
 
     With ``preset`` (as ``h0licow-vi/HE0435``) the lists cut the paper's Table 2; without it ``systems`` and all four
     lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
-    so is ``camera``, which takes the place of the systems' own. ``optics``, one or a list of them, spoil the PSF of the
-    sky; each point is run with each. ``replicates`` repeats each point with seeds seed, seed + 1, ...; with ``until``
-    instead each point is repeated until its mean bias is known to an error.
+    so is ``camera``, which takes the place of the systems' own. ``hosts`` are galaxies beside, or in the place of, the
+    Sersic profiles of the indices ``n``; ``deflectors`` what the lenses have beside their own light and mass, {} being
+    nothing; ``optics``, one or several, spoil the PSF of the sky. ``replicates`` repeats each point with seeds seed,
+    seed + 1, ...; with ``until`` instead each point is repeated until its mean bias is known to an error.
     """
 
     model_config = _CONFIG
@@ -85,9 +89,11 @@ class GridRequest(BaseModel):
     preset: Identifier | None = None
     systems: Systems | None = None
     n: Indices | None = None
+    hosts: Hosts | None = None
     r_eff: Radii | None = None
     magnitude: Magnitudes | None = None
     l_eta: Slopes | None = None
+    deflectors: Deflectors | None = None
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
     optics: OpticsChoice | None = None
@@ -158,10 +164,12 @@ def plan(request: GridRequest, max_runs: int) -> Plan:
     """
     _require_fitting(request)
     # Before anything is looked at: a few lists can mean more systems and slopes than there is time for.
-    lists = (request.systems, request.n, request.r_eff, request.magnitude, request.l_eta)
+    lists = (request.systems, request.r_eff, request.magnitude, request.l_eta)
     if request.preset is None:
-        each = len(request.optics) if isinstance(request.optics, tuple) else 1
-        _limit(math.prod(len(values or ()) for values in lists) * each * request.most_replicates, max_runs)
+        shapes = len(request.n or ()) + len(request.hosts or ())
+        spoilt = len(request.optics) if isinstance(request.optics, tuple) else 1
+        each = shapes * spoilt * len(request.deflectors or (None,)) * request.most_replicates
+        _limit(math.prod(len(values or ()) for values in lists) * each, max_runs)
     _check_own_systems(request)
     runs = Expansion(_grid(request))
     _limit(len(runs), max_runs)
@@ -185,6 +193,9 @@ def _require_fitting(request: GridRequest) -> None:
         raise SpecError("until.estimator", until.estimator, f"one that the analysis computes: {', '.join(computed)}")
     if (until.quantity, until.index_prior) == ("n", "fixed"):
         raise SpecError("until.index_prior", "fixed", "wide or free, since n has no bias where it is fixed")
+    without = [host.label for host in request.hosts or () if host.n is None]
+    if without and (until.quantity == "n" or until.index_prior == "fixed"):
+        raise SpecError("hosts", without, "hosts with an index n, or their biases are never known as until asks")
 
 
 def _check_own_systems(request: GridRequest) -> None:
@@ -214,6 +225,8 @@ def _check(request: GridRequest, realization: Realization) -> None:
         own = error.field.startswith("system.")
         place = (request.systems or ()).index(realization.system) if own else 0
         field = f"systems[{place}].{error.field.removeprefix('system.')}" if own else error.field
+        if field == "deflector" and realization.deflector is not None:
+            field = f"deflectors[{(request.deflectors or ()).index(realization.deflector)}]"
         raise SpecError(field, error.value, error.allowed) from error
 
 
@@ -225,7 +238,7 @@ def _limit(runs: int, allowed: int) -> None:
 def _grid(request: GridRequest) -> Grid:
     cuts: dict[str, Any] = {
         name: None if getattr(request, name) is None else tuple(getattr(request, name))
-        for name in ("systems", "n", "r_eff", "magnitude", "l_eta")
+        for name in ("systems", "n", "hosts", "r_eff", "magnitude", "l_eta", "deflectors")
     }
     changes = {} if request.analysis is None else request.analysis.model_dump(exclude_none=True)
     return Grid(
@@ -255,6 +268,9 @@ def _planned(run: GridRun) -> PlannedRun:
         "n": realization.host.n,
         "r_eff": realization.host.r_eff,
         "magnitude": realization.host.magnitude,
+        "host_kind": realization.host.kind,
+        "host_label": realization.host.label,
+        "deflector": USUAL_DEFLECTOR if realization.deflector is None else realization.deflector.label,
         **{name: getattr(realization.optics or NOMINAL_OPTICS, name) for name in OPTICS_AXES},
         "seed": realization.seed,
     }

@@ -94,7 +94,7 @@ class GridView(_Answer):
     uws_phase: UwsPhase
     n_runs: int
     counts: RunCounts
-    until: UntilView | None
+    until: UntilView | None = None
     """Null where all replicates are wanted."""
     progress: float
     """Share of the runs that have ended."""

@@ -38,7 +38,7 @@ def bias_points(
     quantities: Sequence[HostQuantity],
     most: int,
 ) -> list[BiasPoint]:
-    """Answers of one estimator that have a truth for each of the quantities, in no order.
+    """Answers of one estimator that have a truth for the first of the quantities, in no order.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def bias_points(
         select(*columns)
         .join_from(estimate, result, result.c.run_id == estimate.c.run_id)
         .where(estimate.c.estimator == estimator, estimate.c.index_prior.in_(priors))
-        .where(*(estimate.c[f"{name}_bias"].is_not(None) for name in quantities))
+        .where(estimate.c[f"{quantities[0]}_bias"].is_not(None))
         .limit(most + 1)
     )
     inputs = where.inputs()

@@ -37,6 +37,9 @@ AXES: dict[str, Axis] = {
         Axis("n", input_group.c.n, "Sersic index of the host that was put in", is_number=True),
         Axis("r_eff", input_group.c.r_eff, "Half-light radius of the host that was put in", "arcsec", is_number=True),
         Axis("magnitude", input_group.c.magnitude, "Magnitude of the host that was put in", "AB mag", is_number=True),
+        Axis("host_kind", input_group.c.host_kind, "Kind of the host that was put in: sersic, image, spiral, ..."),
+        Axis("host_label", input_group.c.host_label, "Name of the host that was put in"),
+        Axis("deflector", input_group.c.deflector, "What the deflector has beside one profile and one power law"),
         Axis(
             "defocus_nm",
             input_group.c.defocus_nm,
@@ -129,8 +132,10 @@ def axes_of_run(
 
 
 def _read(axis: Axis, text: str) -> Wanted:
+    if text == NONE and axis.column.nullable:
+        return None
     if not axis.is_number:
-        return None if text == NONE and axis.column.nullable else text
+        return text
     low, dots, high = text.partition("..")
     try:
         bounds = [float(bound) if bound else None for bound in (low, high if dots else low)]

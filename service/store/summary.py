@@ -91,13 +91,15 @@ def _estimates(rows: Sequence[Row[Any]], inputs: Sequence[Sequence[Any]]) -> lis
         part = len(COUNTED) + number * len(_PARTS)
         total, squares, sd, bias, bias_runs = sums[:, part : part + len(_PARTS)].T
         true = [row[place] for row in inputs]
+        # What sums are kept of the shift from.
+        base = np.array([0.0 if value is None else value for value in true])
         # What was divided by nothing is not taken over.
         with np.errstate(divide="ignore", invalid="ignore"):
             shift = total / runs
             spread = np.sqrt(np.maximum(squares / runs - shift * shift, 0.0) * runs / (runs - 1.0))
             columns = (
                 true,
-                (true + shift).tolist(),
+                (base + shift).tolist(),
                 (sd / runs).tolist(),
                 _or_none(spread, runs >= 2),
                 _or_none(bias / bias_runs, bias_runs > 0),

@@ -105,8 +105,9 @@ def _moments(
     true = np.array([_TRUE(row) for row in results], dtype=float)
     mean, sd, bias = (read[:, part : part + len(SUMMED)] for part in range(0, 3 * len(SUMMED), len(SUMMED)))
     known = ~np.isnan(bias)
-    # Sums are kept of the shift from the input: those of squares of a magnitude near 20 would lose its digits.
-    shift = np.nan_to_num(mean - true)
+    # Sums are kept of the shift from the input: those of squares of a magnitude near 20 would lose its digits. Where
+    # there is no input, from zero: an index is small.
+    shift = np.nan_to_num(mean - np.nan_to_num(true))
     bias = np.nan_to_num(bias)
     counted = np.concatenate([np.ones((len(read), 1)), np.nan_to_num(read[:, 3 * len(SUMMED) :])], axis=1)
     return {

@@ -190,9 +190,9 @@ Index(
 
 INPUT_COLUMNS = (
     "system", "camera", "mass_model", "noise_level", "noise_treatment",
-    "l_eta", "n", "r_eff", "magnitude", *OPTICS_AXES, "seed",
+    "l_eta", "n", "r_eff", "magnitude", "host_kind", "host_label", "deflector", *OPTICS_AXES, "seed",
 )  # fmt: skip
-USUAL_INPUTS: dict[str, Any] = {**OPTICS_AXES}
+USUAL_INPUTS: dict[str, Any] = {"host_kind": "sersic", "host_label": "sersic", "deflector": "plain", **OPTICS_AXES}
 """Of runs from before there was anything else, whose inputs do not name these."""
 
 
@@ -206,8 +206,9 @@ def _input_columns() -> list[Column[Any]]:
     types |= dict.fromkeys(OPTICS_AXES, Float())
     types["seed"] = BigInteger()
     usual = {name: str(value) for name, value in USUAL_INPUTS.items()}
+    # A host that is no Sersic profile has no index.
     return [
-        Column(name, types.get(name, String(64)), nullable=False, server_default=usual.get(name))
+        Column(name, types.get(name, String(64)), nullable=name == "n", server_default=usual.get(name))
         for name in INPUT_COLUMNS
     ]
 

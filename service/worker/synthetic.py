@@ -44,7 +44,7 @@ def payload_of(realization: Realization) -> dict[str, Any]:
             "magnitude": quantity(host.magnitude, 0.1),
             "r_eff": quantity(host.r_eff, 0.03),
             "r_eff_galfit": quantity(host.r_eff / (host.q or 0.8) ** 0.5, 0.04),
-            "n": quantity(host.n, 0.3),
+            "n": {"mean": 2.0 + dice.gauss(0.0, 0.3), "sd": 0.3} if host.n is None else quantity(host.n, 0.3),
             "q": quantity(host.q or 0.8, 0.05),
             "position_angle": quantity(host.position_angle or 30.0, 4.0),
             "x": quantity(0.01, 0.001),

@@ -11,8 +11,9 @@ from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.simulate import Simulation, simulate
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host, LensSystem
+from engine.spec.sky import LensSystem
 
 # As plain Python: to compile what the tests ask of lenstronomy takes fifteen seconds, and saves a tenth of one.
 numba_util.numba_enabled = False

@@ -16,8 +16,8 @@ from engine.lensing.lens_equation import solve_lens_equation
 from engine.lensing.power_law import magnification, source_position
 from engine.light.sersic import SersicProfile, surface_brightness
 from engine.simulation.scene import build_scene, check_system, power_law_lens
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 QUADS = ("HE0435", "WFI2033", "RXJ1131")

@@ -21,8 +21,8 @@ from engine.source.grid import SourceGrid
 from engine.source.lensing_matrix import map_rays
 from engine.source.regularisation import SourceModel
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 from tests.engine.conftest import cut
 from tests.engine.dense_oracle import LENS, Case
 from tests.engine.plain_matrices import lensing_matrix

@@ -16,9 +16,9 @@ from engine.parametric.fit import ParametricFit, fit_parametric
 from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.simulation.scene import Scene
 from engine.simulation.simulate import Simulation, simulate_realization
+from engine.spec.host import Host
 from engine.spec.priors import ParameterPrior
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 from tests.engine.conftest import HELD_INDEX, cut
 
 N = COORDINATES.index("n")

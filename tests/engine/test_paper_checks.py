@@ -25,8 +25,8 @@ from engine.posterior.optimum import find_optimum, optimal_strength, start_covar
 from engine.posterior.start import prepare_target
 from engine.simulation.simulate import Simulation, simulate_realization
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 from tests.engine.conftest import cut
 
 SAME = 0.05

@@ -17,9 +17,9 @@ from engine.simulation.simulate import (
     simulate,
     simulate_exposures,
 )
+from engine.spec.host import Host
 from engine.spec.instrument import Optics
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 SPEC = Realization(system="HE0435", l_eta=1.0, host=Host(n=4.0, r_eff=0.39, magnitude=20.5))
 DRAWS = 80

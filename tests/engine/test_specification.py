@@ -31,10 +31,11 @@ from engine.errors import SpecError
 from engine.grid import Grid, expand, preset_names
 from engine.simulation.scene import build_scene
 from engine.spec.analysis import Analysis
+from engine.spec.host import Host
 from engine.spec.instrument import Camera
 from engine.spec.json_text import read_json
 from engine.spec.realization import Realization, realization_from_dict
-from engine.spec.sky import Host, LensSystem
+from engine.spec.sky import LensSystem
 from engine.spec.validation import field_path, path_steps
 
 HE0435 = Realization(system="HE0435", l_eta=1.0, host=Host(n=2.0, r_eff=0.39, magnitude=21.0))

@@ -10,9 +10,9 @@ from engine.conventions import FloatArray
 from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.psf import detector_kernel, telescope_psf
 from engine.simulation.simulate import Simulation, simulate_realization
+from engine.spec.host import Host
 from engine.spec.instrument import Camera
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 
 SHARED_DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data"
 

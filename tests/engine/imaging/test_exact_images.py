@@ -11,8 +11,8 @@ from engine.imaging.exposures import expose
 from engine.imaging.optics.exposed import ExposedOptics
 from engine.simulation.scene import build_scene
 from engine.simulation.simulate import Simulation
+from engine.spec.host import Host
 from engine.spec.realization import Realization
-from engine.spec.sky import Host
 from tests.engine.imaging.conftest import Setup
 
 
