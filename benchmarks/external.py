@@ -34,12 +34,13 @@ from engine.imaging.convolution import convolve, point_source_image
 from engine.imaging.cusps import place_cusps
 from engine.imaging.optics.exposed import ExposedOptics
 from engine.imaging.psf import detector_kernel
+from engine.imaging.telescope import optical_psf
 from engine.lensing.lens_equation import LensedImage, solve_lens_equation
 from engine.lensing.power_law import PowerLawLens, source_position
 from engine.light.rendering import render_sersic
 from engine.light.sersic import SersicProfile
 from engine.simulation.scene import PointSource, Scene
-from engine.simulation.simulate import combine, high_resolution_host, optical_psf, scene_geometry, simulate_exposures
+from engine.simulation.simulate import combine, high_resolution_host, scene_geometry, simulate_exposures
 
 _PSF_SIDE, _PSF_PEAK, _PSF_REACH = 81, 38, 2.9
 _PSF_FIELD = 131

@@ -32,10 +32,11 @@ from engine.imaging.psf import (
     detector_kernel,
     telescope_psf,
 )
+from engine.imaging.telescope import optical_psf
 from engine.lensing.lens_equation import solve_lens_equation
 from engine.light.rendering import render_sersic
 from engine.simulation.scene import Scene, build_scene
-from engine.simulation.simulate import optical_psf, scene_geometry, simulate
+from engine.simulation.simulate import scene_geometry, simulate
 from engine.spec.host import Host
 from engine.spec.realization import Realization
 from tests.engine.angular_solver import AngularSolver

@@ -56,7 +56,7 @@ from engine.result import (
 from engine.spec.analysis import PROFILES, Analysis
 from engine.spec.deflector import USUAL_DEFLECTOR, Deflector
 from engine.spec.host import Host, HostImage, HostShape, MadeGalaxy
-from engine.spec.instrument import Camera, CameraChoice, NoiseLevel, Optics
+from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, NoiseLevel, Optics, OpticsChoice
 from engine.spec.json_text import read_json
 from engine.spec.priors import ParameterPrior
 from engine.spec.quantities import Identifier
@@ -199,6 +199,7 @@ __all__ = [
     "GROUPINGS",
     "HOST_QUANTITIES",
     "NEAR",
+    "NOMINAL_OPTICS",
     "PREDICTED",
     "PRINTABLE",
     "PROFILES",
@@ -254,6 +255,7 @@ __all__ = [
     "Observation",
     "ObservationError",
     "Optics",
+    "OpticsChoice",
     "ParameterPrior",
     "PosteriorError",
     "Predictor",

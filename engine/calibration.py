@@ -156,7 +156,7 @@ def _host_like(found: ImageMeasurement, rng: np.random.Generator) -> SersicProfi
 def _image_with(found: ImageMeasurement, host: SersicProfile, rng: np.random.Generator) -> FloatArray:
     """The image (ny, nx) with another host, and what the old one departs from its profile by, in noise of its own."""
     fit, observation = found.fit, found.observation
-    seen = replace(observation, psf=fit.psf).optics
+    seen = fit.seen_through(observation).optics
     departs = fit.arc - seen.sersic_image(fit.host, fit.lens)
     arc = seen.sersic_image(host, fit.lens) + host.flux / fit.host.flux * departs
     return fit.model - fit.arc + arc + found.noise_scale * _noise(observation, rng)

@@ -125,5 +125,8 @@ def _departures(truth: Simulation) -> tuple[str, ...]:
         out.append(f"noise: camera has no level {noise.requested!r}, {noise.level!r} was used")
     if optics != NOMINAL_OPTICS:
         spoilt = f"{optics.defocus_nm:g} nm of defocus and {optics.jitter:g} arcsec of jitter"
+        spoilt += f", {optics.colour:g} of colour" if optics.colour else ""
+        spoilt += f", a residual of {optics.residual:g}" if optics.residual else ""
+        spoilt += f", known on {optics.coarse} sub-pixels" if optics.coarse > 1 else ""
         out.append(f"optics: simulated with {spoilt}, analysed with the nominal PSF")
     return tuple(out)

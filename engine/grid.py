@@ -25,7 +25,7 @@ from engine.errors import SpecError
 from engine.spec.analysis import Analysis
 from engine.spec.deflector import Deflector
 from engine.spec.host import Host, HostShape
-from engine.spec.instrument import Camera, CameraChoice, Dither, NoiseLevel, Optics
+from engine.spec.instrument import NOMINAL_OPTICS, Camera, CameraChoice, Dither, NoiseLevel, Optics, OpticsChoice
 from engine.spec.quantities import Count, Identifier, Magnitude, Radius, SersicIndex, Slope
 from engine.spec.realization import Realization
 from engine.spec.sky import LensSystem, SystemChoice
@@ -55,7 +55,8 @@ class Grid:
     Without it, ``systems`` (names of the catalogue, or lens systems of one's own) and all four lists of values must be
     given and every combination is run. ``hosts`` are galaxies beside, or in the place of, Sersic profiles of the
     indices ``n``; ``deflectors`` what the lenses have beside their own light and mass, {} being nothing. ``camera``
-    takes the place of the systems' own. ``replicates`` repeats each point with seeds seed, seed + 1, ...
+    takes the place of the systems' own. ``optics``, one or several, spoil the PSF of the sky: each point is run with
+    each, {} being nothing. ``replicates`` repeats each point with seeds seed, seed + 1, ...
     """
 
     preset: Identifier | None = None
@@ -68,7 +69,7 @@ class Grid:
     deflectors: Deflectors | None = None
     mass_model: Identifier = "recommended"
     noise_level: NoiseLevel = "author"
-    optics: Optics | None = None
+    optics: OpticsChoice | None = None
     seed: FirstSeed = 0
     replicates: Replicates = 1
     analysis: Analysis = Field(default_factory=Analysis)
@@ -104,34 +105,35 @@ class Expansion:
 
     def __init__(self, grid: Grid) -> None:
         _require_own_names(grid)
-        self._grid = grid
+        self._grid, self._optics = grid, _each_optics(grid)
         self._paper = None if grid.preset is None else _paper_points(grid)
         samples = list(_samples(grid)) if self._paper is None else self._paper
         by_setting = {point.setting: point for point in samples}
         counts = Counter(point.setting for point in samples)
         _require_known_parts(grid, list(by_setting.values()))
-        self.samples = tuple(self._run(point, 0) for point in by_setting.values())
+        self.samples = tuple(self._run(point, 0, self._optics[0]) for point in by_setting.values())
         each = len(self) // len(samples)
         self.shares = tuple(counts[setting] * each for setting in by_setting)
 
     def __len__(self) -> int:
         """How many runs there are."""
         points = prod(map(len, _axes(self._grid))) if self._paper is None else len(self._paper)
-        return points * self._grid.replicates
+        return points * len(self._optics) * self._grid.replicates
 
     def __iter__(self) -> Iterator[GridRun]:
         """Make the runs, anew each time."""
         for point in _free_points(self._grid) if self._paper is None else self._paper:
-            for replicate in range(self._grid.replicates):
-                yield self._run(point, replicate)
+            for optics, replicate in product(self._optics, range(self._grid.replicates)):
+                yield self._run(point, replicate, optics)
 
     def by_replicate(self) -> Iterator[GridRun]:
         """The same runs in another order: the first replicate of each point, then the second of each, and so on."""
         for replicate in range(self._grid.replicates):
             for point in _free_points(self._grid) if self._paper is None else self._paper:
-                yield self._run(point, replicate)
+                for optics in self._optics:
+                    yield self._run(point, replicate, optics)
 
-    def _run(self, point: _Point, replicate: int) -> GridRun:
+    def _run(self, point: _Point, replicate: int, optics: Optics | None) -> GridRun:
         grid, host = self._grid, point.host
         realization = Realization(
             system=point.system,
@@ -140,13 +142,14 @@ class Expansion:
             deflector=point.deflector,
             seed=grid.seed + replicate,
             noise_level=grid.noise_level,
-            optics=grid.optics,
+            optics=optics,
             mass_model=grid.mass_model,
             camera=grid.camera,
             analysis=grid.analysis,
         )
         name = point.name if point.number is None else f"{point.number:02d}"
-        suffix = f"#{replicate + 1}" if grid.replicates > 1 else ""
+        suffix = f"_{(optics or NOMINAL_OPTICS).label}" if len(self._optics) > 1 else ""
+        suffix += f"#{replicate + 1}" if grid.replicates > 1 else ""
         return GridRun(f"{realization.system_name}/{name}{suffix}", point.number, realization)
 
 
@@ -187,6 +190,15 @@ def _require_own_names(grid: Grid) -> None:
         dither = system.exposures.dither
         if isinstance(dither, Dither) and dither.name in dither_names():
             raise SpecError(f"{where}.exposures.dither.name", dither.name, "a name that the catalogue does not have")
+
+
+def _each_optics(grid: Grid) -> tuple[Optics | None, ...]:
+    """What the points are run with; in a list, optics that spoil nothing are the same as none."""
+    if not isinstance(grid.optics, tuple):
+        return (grid.optics,)
+    if len(set(grid.optics)) != len(grid.optics):
+        raise SpecError("optics", [one.label for one in grid.optics], "a list without repeated values")
+    return tuple(None if one == NOMINAL_OPTICS else one for one in grid.optics)
 
 
 def _require_own_camera(camera: str | Camera | None, where: str) -> None:

@@ -67,6 +67,7 @@ def inspect_inversion(
     """
     with threadpool_limits(1):
         fit = fit or fit_parametric(observation, agn_images=agn_images, deflector=deflector, shear=shear)
+        observation = fit.seen_through(observation)
         problem = prepare_problem(observation, fit, analysis)
         target = prepare_target(problem, fit, analysis)
         # A third of a deviation may be left the first time, which is enough to begin a chain and not to be looked at.

@@ -27,7 +27,7 @@ from engine.parametric.fit import ParametricFit
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
 from engine.plausibility import require_hints, require_lens, unlikely
-from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, poor_fit, undetected
+from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, of_model, poor_fit, undetected
 from engine.result import Estimate, LensParameter, Quantity
 from engine.several_psfs import PsfFit, averaged
 from engine.spec.analysis import PROFILES, Analysis
@@ -229,18 +229,6 @@ def _chi2(observation: Observation, fit: ParametricFit, residual: FloatArray, sc
     return float(np.sum(residual[used] ** 2 / variance))
 
 
-def _of_model(fit: ParametricFit) -> list[str]:
-    """What is said of a model that is not exact."""
-    if fit.error is None:
-        return []
-    told = []
-    if fit.error.psf > 0:
-        told.append(f"psf: by the AGN images the stamp is wrong by {fit.error.psf:.0%} of its light; corrected by them")
-    if fit.error.host > 0:
-        told.append(f"host: departs from its Sersic profile by {fit.error.host:.0%} of its light")
-    return [f"{one}; the errors hold what that leaves open" for one in told]
-
-
 def _by_name(parameters: Sequence[LensParameter]) -> dict[str, Quantity]:
     return {found.name: found.value for found in parameters}
 
@@ -345,7 +333,7 @@ def measure_image(
     warnings += [] if found.inversion is None else found.inversion.warnings
     if fit.stamp_error > _WRONG_STAMP:
         warnings.append(f"psf: residuals at the AGN images are {fit.stamp_error:.1f} times what is allowed for a stamp")
-    warnings += _of_model(fit)
+    warnings += of_model(fit)
     warnings += [f"bound: {name} ended at a bound of the parametric fit" for name in fit.at_bound]
     status = status_of(fit, host, chi2)
     warnings += filter(None, (poor_fit(chi2), undetected(host) if not_detected(fit, host) else ""))

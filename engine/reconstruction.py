@@ -25,6 +25,7 @@ from engine.estimators.refit import refit_draws
 from engine.estimators.sersic_fit import Refit
 from engine.estimators.summaries import summarise_all
 from engine.imaging.observation import Observation
+from engine.imaging.telescope import NOMINAL_STATE
 from engine.likelihood.evidence import Inversion
 from engine.likelihood.problem import Problem, prepare_problem
 from engine.parametric.fit import GOOD_START, Acceptance, ParametricFit, fit_parametric
@@ -167,8 +168,7 @@ def analyse(
                     positions=positions, acceptance=acceptance, priors=analysis.priors, fixed_index=fixed_index,
                     real_galaxy=real_galaxy, centre=centre,
                 )  # fmt: skip
-        if fit.error is not None:
-            observation = replace(observation, psf=fit.psf)
+        observation = fit.seen_through(observation)
         inversion = _sampled(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:
@@ -186,6 +186,7 @@ def analyse(
     )  # fmt: skip
     told = [
         *warnings,
+        *of_model(fit),
         *(undetected(one) for one in estimates if one.estimator == "image" and one.index_prior == "wide"),
     ]
     told.append(poor_fit(found.chi2 / found.degrees_of_freedom))
@@ -197,6 +198,22 @@ def poor_fit(misfit: float) -> str:
     if misfit <= POOR_FIT:
         return ""
     return f"model: chi2 per degree of freedom is {misfit:.2f}; the errors do not cover what it misses"
+
+
+def of_model(fit: ParametricFit) -> list[str]:
+    """What is said of a model that is not exact."""
+    told = []
+    if fit.response is not None and fit.response.state != NOMINAL_STATE:
+        state = fit.response.state
+        told.append(
+            f"psf: by the AGN images the telescope has {state.defocus_nm:+.1f} nm of defocus, "
+            f"{state.blur:+.2g} arcsec^2 of blur and {state.colour:+.1f} of colour"
+        )
+    if fit.error is not None and fit.error.psf > 0:
+        told.append(f"psf: by the AGN images the stamp is wrong by {fit.error.psf:.0%} of its light; corrected by them")
+    if fit.error is not None and fit.error.host > 0:
+        told.append(f"host: departs from its Sersic profile by {fit.error.host:.0%} of its light")
+    return [f"{one}; the errors hold what that leaves open" for one in told]
 
 
 def undetected(host: Estimate) -> str:

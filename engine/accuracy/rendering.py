@@ -18,10 +18,10 @@ from engine.imaging.drizzling import drizzle
 from engine.imaging.exposures import expose
 from engine.imaging.geometry import Geometry
 from engine.imaging.psf import detector_kernel
+from engine.imaging.telescope import optical_psf
 from engine.lensing.power_law import PowerLawLens
 from engine.light.rendering import DEFAULT_TOLERANCE, render_sersic, sample_sersic
 from engine.light.sersic import SersicProfile
-from engine.simulation.simulate import optical_psf
 
 STAGE = "rendering"
 INTEGRATION = Knob(

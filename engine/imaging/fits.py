@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from engine.errors import ObservationError
 from engine.imaging.geometry import Geometry
 from engine.imaging.observation import Observation
 from engine.imaging.optics.exposed import ExposedOptics
+from engine.imaging.telescope import TelescopeState
+from engine.spec.realization import camera_from_mapping, camera_to_mapping
 
 FORMAT_VERSION = 2
 _KEYWORD = re.compile(r"[A-Z][A-Z0-9_-]{0,7}")
@@ -112,6 +114,11 @@ def _exposures(response: ExposedOptics) -> fits.ImageHDU:
     plane.header["LONGSTRN"] = "OGIP 1.0"
     plane.header["SAMPLING"] = json.dumps(asdict(response.geometry))
     plane.header["DETECTOR"] = json.dumps(response.detector_kernel.tolist())
+    if response.correction is not None:
+        raise ObservationError("response: a PSF that a fit has corrected is not written")
+    if response.camera is not None:
+        plane.header["CAMERA"] = json.dumps(camera_to_mapping(response.camera))
+        plane.header["STATE"] = json.dumps(asdict(response.state))
     return plane
 
 
@@ -123,7 +130,12 @@ def _response(plane: fits.ImageHDU) -> ExposedOptics:
         geometry = Geometry(**tuples)
     except TypeError as error:
         raise ObservationError(f"EXPOSURES: its sampling is not of this layout ({error})") from error
-    return ExposedOptics(plane.data.astype(np.float64), geometry, np.array(json.loads(plane.header["DETECTOR"])))
+    kernel = np.array(json.loads(plane.header["DETECTOR"]))
+    response = ExposedOptics(plane.data.astype(np.float64), geometry, kernel)
+    if "CAMERA" not in plane.header:
+        return response
+    camera = camera_from_mapping(json.loads(plane.header["CAMERA"]))
+    return replace(response, camera=camera, state=TelescopeState(**json.loads(plane.header["STATE"])))
 
 
 def _tuples(value: Any) -> Any:

@@ -95,7 +95,7 @@ def _nm_to_lambda_over_d(camera: Camera) -> float:
     return math.degrees(1e-9 / camera.pupil.primary_diameter_m) * 3600.0
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _telescope_psf(
     camera: Camera, *, scale: float, size: int, defocus_nm: float, jitter: float, pupil_pixels: int
 ) -> FloatArray:

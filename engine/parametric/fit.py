@@ -17,6 +17,7 @@ import numpy as np
 from engine.conventions import FloatArray
 from engine.errors import PosteriorError, SpecError
 from engine.imaging.observation import Observation
+from engine.imaging.optics.exposed import ExposedOptics
 from engine.lensing.power_law import PowerLawLens
 from engine.light.sersic import SersicProfile, profile_of
 from engine.parametric.constraints import worst_miss
@@ -24,12 +25,14 @@ from engine.parametric.galaxies import asks_for_galaxy, with_galaxy
 from engine.parametric.host_posterior import COORDINATES, HostPosterior
 from engine.parametric.model import ImageModel
 from engine.parametric.numerical_error import HostShift, host_shifts
+from engine.parametric.optics_error import BLUR_SD, COLOUR_SD, DEFOCUS_SD
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.refine import SUBRAYS, polished, ranked
 from engine.parametric.search import Acceptance, Task, find_starts, quick_fits, varied_starts
 from engine.parametric.shared_error import ModelError
 from engine.parametric.solution import Solution
+from engine.parametric.starts import Start
 from engine.parametric.uncertainty import host_posteriors, parameter_covariance, positive_mean
 from engine.result import IndexPrior
 from engine.spec.priors import LensParameterName, ParameterPrior
@@ -40,6 +43,10 @@ GOOD_START = Acceptance()
 _N = COORDINATES.index("n")
 _DOUBTFUL = 1.5
 """chi^2 per degree of freedom from which on an acceptable fit may be a false minimum: others are tried as well."""
+_FAR = 0.2
+"""Deviations of its prior by which a state of the telescope has to move for a search to be begun anew."""
+_SEARCHES = 4
+"""How often the optics may be learned and the search begun anew."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +62,8 @@ class ParametricFit:
     covariances let arcs be off, which no Sersic profile describes; ``chi2`` does not. ``hosts`` are the posteriors of
     the host with each prior of n, without those that could not be fitted. ``model`` and ``arc`` are images (ny, nx) of
     all and of the lensed host [e-/s], with what the model is wrong by where the residuals show that: ``error`` says how
-    much, or is None, and ``psf`` (n, n) is the stamp with its correction. ``shifts`` are numerical errors of the
-    ``hosts``.
+    much, or is None, and ``psf`` (n, n) is the stamp with its correction, ``response`` the exposures with theirs.
+    ``shifts`` are numerical errors of the ``hosts``.
     """
 
     lens: PowerLawLens
@@ -77,6 +84,7 @@ class ParametricFit:
     arc: FloatArray
     sigma: FloatArray
     psf: FloatArray
+    response: ExposedOptics | None
     error: ModelError | None
     shifts: Mapping[IndexPrior, HostShift] = field(default_factory=dict)
 
@@ -84,6 +92,12 @@ class ParametricFit:
     def misfit(self) -> float:
         """chi^2 per degree of freedom where it is above one: by this the variances are larger than ``sigma`` says."""
         return max(1.0, self.chi2 / self.degrees_of_freedom)
+
+    def seen_through(self, observation: Observation) -> Observation:
+        """The observation that was fitted, with the optics that the fit has learned."""
+        if self.error is None and self.response in (None, observation.response):
+            return observation
+        return replace(observation, psf=self.psf, response=self.response)
 
 
 def fit_parametric(
@@ -142,28 +156,71 @@ def fit_parametric(
     task = Task(
         observation, deflector, shear, acceptance, priors, dark_host=real_galaxy, near=centre, anywhere=real_galaxy
     )
-    groups = find_starts(task, agn_images, theta_E, positions)
-    best: ParametricFit | None = None
-    refusals: list[str] = []
     told = positions is not None or agn_images is not None
-    for wave in (groups, [varied_starts(group) for group in groups]):
-        for solution in ranked(task, [quick_fits(task, group) for group in wave]):
-            try:
-                reached = polished(task, solution)
-                if real_galaxy and deflector and asks_for_galaxy(reached):
-                    reached = with_galaxy(task, reached, theta_E, agn_told=told)
-                found = fit_of(task, reached, fixed_index)
-            except PosteriorError as error:
-                refusals.append(str(error))
-                continue
-            # Behind a galaxy of Gaussians every Einstein radius has been tried.
-            if found.misfit < _DOUBTFUL or found.deflector_gaussians:
-                return found
-            if best is None or found.misfit < best.misfit:
-                best = found
+    refusals: list[str] = []
+    best: ParametricFit | None = None
+    for _ in range(_SEARCHES):
+        groups = find_starts(task, agn_images, theta_E, positions)
+        best, elsewhere = _searched(task, groups, refusals, theta_E, fixed_index, agn_told=told)
+        if elsewhere is None:
+            break
+        # The PSF that misled this search is known better now.
+        task = replace(task, observation=elsewhere)
     if best is not None:
         return best
     raise PosteriorError("; then ".join(dict.fromkeys(refusals)) or "parametric model: no start has a positive host")
+
+
+def _searched(
+    task: Task,
+    groups: list[list[Start]],
+    refusals: list[str],
+    theta_E: float | None,
+    fixed_index: float | None,
+    *,
+    agn_told: bool,
+) -> tuple[ParametricFit | None, Observation | None]:
+    """The best fit from groups of starts; ``refusals`` gains what the others were refused for.
+
+    The second is the observation with its optics in the state that a doubtful fit has learned, to be searched anew.
+    """
+    best: ParametricFit | None = None
+    for wave in (groups, [varied_starts(group) for group in groups]):
+        for solution in ranked(task, [quick_fits(task, group) for group in wave]):
+            learned: Observation | None = None
+            try:
+                reached = polished(task, solution)
+                if _is_elsewhere(task.observation.response, reached.model.observation.response):
+                    learned = reached.model.observation
+                if task.dark_host and task.deflector and asks_for_galaxy(reached):
+                    reached = with_galaxy(task, reached, theta_E, agn_told=agn_told)
+                found = fit_of(task, reached, fixed_index)
+            except PosteriorError as error:
+                refusals.append(str(error))
+                if learned is not None:
+                    return best, learned
+                continue
+            # Behind a galaxy of Gaussians every Einstein radius has been tried.
+            if found.misfit < _DOUBTFUL or found.deflector_gaussians:
+                return found, None
+            if best is None or found.misfit < best.misfit:
+                best = found
+            if learned is not None:
+                return best, learned
+    return best, None
+
+
+def _is_elsewhere(one: ExposedOptics | None, other: ExposedOptics | None) -> bool:
+    """Whether optics have moved so far that a search with the others may end elsewhere."""
+    if one is None or other is None or one is other:
+        return False
+    here, there = one.state, other.state
+    moved = (
+        abs(there.defocus_nm - here.defocus_nm) / DEFOCUS_SD,
+        abs(there.blur - here.blur) / BLUR_SD,
+        abs(there.colour - here.colour) / COLOUR_SD,
+    )
+    return max(moved) > _FAR or (one.correction is None and other.correction is not None)
 
 
 def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> ParametricFit:
@@ -217,6 +274,7 @@ def fit_of(task: Task, solution: Solution, fixed_index: float | None = None) -> 
         arc=(columns[:, HOST_FLUX] * flux).reshape(shape) + host_departs,
         sigma=model.sigma if solution.noise is None else solution.noise,
         psf=model.observation.psf,
+        response=model.observation.response,
         error=solution.error,
         shifts=host_shifts(
             solution, jacobian, amplitudes, {prior: host.covariance[_N, _N] == 0.0 for prior, host in hosts.items()}

@@ -195,6 +195,20 @@ class ImageModel:
         out._anchors = {}
         return out
 
+    def exact_only(self) -> ImageModel:
+        """The same model without shared errors: it takes the optics at their word."""
+        if self._shared is None:
+            return self
+        out = copy(self)
+        out.shared, out._shared = None, None
+        out._observed, out._target = (seen - self._shared.offset for seen in (self._observed, self._target))
+        out.data = out._target
+        return out
+
+    def missed(self, values: FloatArray) -> FloatArray:
+        """Whitened residuals (pixels,) without what shared errors explain of them."""
+        return self.exact_only().amplitudes(values)[1]
+
     def columns(self, values: FloatArray) -> FloatArray:
         """Whitened columns (pixels, amplitudes)."""
         space = self.space

@@ -1,11 +1,12 @@
 """The fit of an image with what its model may be wrong by: the stamp of the PSF, and the host's shape.
 
-What the residuals of a fit say of both corrects the stamp and is marginalised in the next fit, a few times over. Only
-where a stamp is all that is known of the optics: an observation whose exposures are known is taken at its word.
+What the residuals of a fit say of both corrects the stamp and is marginalised in the next fit, a few times over. Where
+the exposures are known they are asked only if the residuals where AGN images and arcs shine are not those of noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ from engine.parametric.shared_error import ModelError, SharedError, likeliest_er
 from engine.parametric.solution import Solution
 from engine.parametric.source_error import lensed_modes
 
-_LEFT = (0.5, 1.0, 2.0, 4.0)
+MOVED = (0.5, 1.0, 2.0, 4.0)
 """Errors of moved stamps beside that of the stamp, in units of what they are allowed, that are tried."""
 _GAIN = 10.0
 """ln of the evidence for errors of the model from which on they are believed."""
@@ -40,6 +41,7 @@ def learned(
     base: FloatArray,
     stamps: FloatArray,
     fitted: NDArray[np.bool_],
+    left: Sequence[float] = MOVED,
 ) -> Learned | None:
     """What a fit of the whole image says of the errors of its model; None where it shows none.
 
@@ -52,6 +54,8 @@ def learned(
         moved stamps of these are allowed.
     fitted : array (ny, nx)
         Pixels that count.
+    left : sequence of numbers
+        Errors of moved stamps beside that of the stamp, in units of what they are allowed, that are tried.
     """
     model, space = solution.model, solution.space
     amplitudes, _, _ = model.amplitudes(solution.values)
@@ -61,14 +65,13 @@ def learned(
         host = _flat(lensed_modes(model, solution.values, float(amplitudes[HOST_FLUX])))
     modes = stamp_modes(given) if space.n_agn else np.zeros((0, *given.shape))
     psf = _flat(laid_modes(modes, _places(solution), model.shape))
-    residual = model.observation.image.ravel() - model.image(solution.values, amplitudes).ravel()
+    residual = model.unwhitened(model.missed(solution.values)[:, None], np.ones(1))[model.window].ravel()
     if known is not None and space.n_agn:
         # Of the stamp that was given: what the correction made of it is part of the error.
         residual = residual + laid_modes(known.correction[None], _places(solution), model.shape).ravel()
-    counted = fitted.ravel() & np.isfinite(base.ravel())
+    counted = fitted.ravel() & np.isfinite(base.ravel()) & (model.weight > 0)
     noise, moved = base.ravel()[counted] ** 2, stamps.ravel()[counted]
-    left = _LEFT if space.n_agn else (1.0,)
-    sigmas = [(error, np.sqrt(noise + error**2 * moved)) for error in left]
+    sigmas = [(error, np.sqrt(noise + error**2 * moved)) for error in (left if space.n_agn else (1.0,))]
     found = likeliest_errors([host[counted], psf[counted]], residual[counted], sigmas)
     if found.gain < _GAIN:
         return None

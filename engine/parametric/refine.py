@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from engine.conventions import FloatArray, pixel_centres
 from engine.lensing.power_law import PowerLawLens
+from engine.parametric.misfit import misfit_significance, shared_noise
 from engine.parametric.model import ImageModel, weights_sigma
 from engine.parametric.model_error import learned
+from engine.parametric.optics_error import learned_optics, stamp_is_wrong
 from engine.parametric.parameters import BACKGROUND, HOST_FLUX, ParameterSpace
 from engine.parametric.point_sources import Detection
 from engine.parametric.residual_noise import measured_stamp_error, noise_scale
@@ -26,8 +28,18 @@ SUBRAYS = 2
 _STEPS = 40
 _HOPELESS = 10.0
 """Times by which chi^2 may exceed what is accepted for errors of the model to be looked for in it."""
+_DOUBTFUL = 1.5
+"""Chi^2 per pixel from which on the optics are asked before a fit is made exact."""
+_MISLED = 20.0
+"""Chi^2 per pixel from which on a fit by a wrong PSF has led elsewhere, so that another would end there too."""
+_TELLING = 0.3
+"""Part of such a chi^2 that the PSF must explain."""
 _ROUNDS = 3
 """Fits with errors of the model: each learns from the one before."""
+_ASKED = 4.0
+"""Deviations of residuals from noise from which on errors of the model of known exposures are looked for."""
+_SHINING = 3.0
+"""Light in that of the noise from which on a pixel may tell of such errors."""
 _SHEAR_SHOWS = 4.0
 """Square of the shear in its errors below which a lens is taken to have none: two a component, as of the AIC.
 
@@ -79,12 +91,86 @@ def polished(task: Task, solution: Solution) -> Solution:
         task = replace(task, observation=best.model.observation)
     if task.shear is None and not _shear_shows(best):
         best = full_fit(task, best, best.model.sigma, shear=False, shared=best.model.shared)
-    for _ in range(task.observation.optics.correction_rounds):
-        best = minimise(
-            best.model.corrected(best.values), best.start, best.values, NEAR_STEPS, TOLERANCE,
-            stamp_error=best.stamp_error,
-        )  # fmt: skip
+    if best.cost < _DOUBTFUL * best.model.pixels:
+        best = _exactly(best)
+    if task.observation.response is not None:
+        state = _with_state_learned(task, best)
+        if state is not best and best.cost > _MISLED * best.model.pixels:
+            return state
+        known = _with_exposures_learned(task, state)
+        best = _exactly(best) if known is best and best.cost >= _DOUBTFUL * best.model.pixels else known
     return best
+
+
+def _exactly(solution: Solution) -> Solution:
+    """The fit with exact columns, as far as the optics know any (:meth:`~.model.ImageModel.corrected`)."""
+    for _ in range(solution.model.observation.optics.correction_rounds):
+        model = solution.model.corrected(solution.values)
+        found = minimise(
+            model, solution.start, solution.values, NEAR_STEPS, TOLERANCE, stamp_error=solution.stamp_error
+        )
+        solution = replace(found, error=solution.error)
+    return solution
+
+
+def _with_state_learned(task: Task, solution: Solution) -> Solution:
+    """The fit with the telescope in the state that its AGN images ask for; the same where they ask for none."""
+    for _ in range(_ROUNDS):
+        found, response = learned_optics(solution), task.observation.response
+        if found is None or response is None:
+            break
+        misled = solution.cost > _MISLED * solution.model.pixels
+        if misled and found.explained < _TELLING * solution.cost:
+            # A false minimum, whatever the PSF: another start is wanted.
+            break
+        other, psf = response.in_state(found.state), task.observation.psf
+        psf = psf + response.stamp_change(other, psf.shape[0] // 2)
+        task = replace(task, observation=replace(task.observation, psf=psf, response=other))
+        if misled:
+            # Nothing but the state of the telescope is worth keeping of it: a search begins anew from there.
+            return full_fit(task, solution, fitted_sigma(task, solution), shear=solution.space.shear, steps=1)
+        solution = _exactly(_refitted(task, solution, found.shared))
+    return solution
+
+
+def _with_exposures_learned(task: Task, solution: Solution) -> Solution:
+    """The fit with what stamp and host are wrong by beside the telescope's state, where the residuals ask for it."""
+    seen, state = solution.model.observation, solution.model.shared
+    response, given, known = seen.response, seen.psf, solution.error
+    if response is None or solution.cost > _HOPELESS * task.acceptance.chi2_per_dof * solution.model.pixels:
+        return solution
+    correlation = shared_noise(seen)
+    if not stamp_is_wrong(solution) and misfit_significance(*_lit(solution), correlation) < _ASKED:
+        return solution
+    for _ in range(_ROUNDS):
+        stamps, _ = _variances(task, solution)
+        # Neighbours share their noise, so that there is more of it in what is smooth.
+        base = weights_sigma(seen) * math.sqrt(max(1.0, float(correlation.sum())))
+        found = learned(solution, given, known, base, stamps, _fitted(task, solution.lens, solution.agn()), (1.0,))
+        if found is None:
+            break
+        known = found.error
+        before = np.zeros_like(given) if response.correction is None else response.correction
+        corrected = replace(response, correction=before + known.correction)
+        task = replace(task, observation=replace(seen, psf=given + known.correction, response=corrected))
+        shared = found.shared if state is None else found.shared.beside(state)
+        solution = _exactly(_refitted(task, replace(solution, error=known), shared))
+    return solution
+
+
+def _refitted(task: Task, solution: Solution, shared: SharedError) -> Solution:
+    """The fit of the task's observation from another one, with errors that pixels share."""
+    return full_fit(task, solution, fitted_sigma(task, solution), shear=solution.space.shear, shared=shared)
+
+
+def _lit(solution: Solution) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Whitened residuals (ny, nx) of a fit, and where AGN images or arcs outshine the noise."""
+    model, observation = solution.model, solution.model.observation
+    amplitudes, _, columns = model.amplitudes(solution.values)
+    host = model.unwhitened(columns[:, HOST_FLUX:BACKGROUND], amplitudes[HOST_FLUX:BACKGROUND])
+    shining = agn_light(observation, solution.agn()) + host
+    counted = np.isfinite(model.sigma) & observation.valid
+    return model.explained(solution.values)[2].reshape(model.shape), counted & (shining > _SHINING * observation.noise)
 
 
 def _with_model_error(task: Task, solution: Solution) -> Solution:
@@ -113,7 +199,13 @@ def _noise_excess(task: Task, solution: Solution) -> FloatArray:
 
 
 def full_fit(
-    task: Task, solution: Solution, sigma: FloatArray, *, shear: bool, shared: SharedError | None = None
+    task: Task,
+    solution: Solution,
+    sigma: FloatArray,
+    *,
+    shear: bool,
+    shared: SharedError | None = None,
+    steps: int = _STEPS,
 ) -> Solution:
     """The fit of the whole image that begins where another ended."""
     ny, nx = task.observation.shape
@@ -124,7 +216,7 @@ def full_fit(
         galaxy=solution.model.galaxy,
     )  # fmt: skip
     values = solution.space.with_shear(solution.values, shear=shear)
-    found = minimise(model, solution.start, values, _STEPS, TOLERANCE, stamp_error=solution.stamp_error)
+    found = minimise(model, solution.start, values, steps, TOLERANCE, stamp_error=solution.stamp_error)
     return replace(found, error=solution.error)
 
 

@@ -37,6 +37,12 @@ class SharedError:
     mean: FloatArray
     of_host: int
 
+    def beside(self, other: SharedError) -> SharedError:
+        """These errors and another one's, which are none of the host."""
+        return SharedError(
+            np.concatenate([self.columns, other.columns], axis=1), np.concatenate([self.mean, other.mean]), self.of_host
+        )
+
     @cached_property
     def _directions(self) -> tuple[FloatArray, FloatArray]:
         """Orthonormal basis (pixels, k) of the columns that show, and the size (k,) of what they put on each."""

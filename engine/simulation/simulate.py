@@ -25,12 +25,13 @@ from engine.imaging.geometry import Geometry, exposure_geometry
 from engine.imaging.noise import ExposureNoise, draw_noise, exposure_noise
 from engine.imaging.observation import Observation, Provenance
 from engine.imaging.optics.exposed import ExposedOptics
-from engine.imaging.psf import detector_kernel, telescope_psf
+from engine.imaging.psf import detector_kernel
+from engine.imaging.telescope import known_psf, optical_psf
 from engine.light.galaxy import profiles_of, render_light
 from engine.simulation.scene import Scene, build_scene
 from engine.simulation.seeds import sky_generator
 from engine.spec.deflector import USUAL_DEFLECTOR
-from engine.spec.instrument import NOMINAL_OPTICS, Camera, NoiseLevel, Optics
+from engine.spec.instrument import Camera, NoiseLevel
 from engine.spec.realization import Realization
 
 _PSF_REACH = 5.0
@@ -74,17 +75,12 @@ def scene_geometry(scene: Scene) -> Geometry:
     return exposure_geometry(scene.camera, resolve_dither(scene.system), (side, side))
 
 
-def optical_psf(camera: Camera, oversampling: int, optics: Optics = NOMINAL_OPTICS) -> FloatArray:
-    """PSF of a camera on sub-pixels, computed once per process."""
-    return telescope_psf(camera, oversampling=oversampling, defocus_nm=optics.defocus_nm, jitter=optics.jitter)
-
-
 @lru_cache(maxsize=8)
-def image_psf(camera: Camera, geometry: Geometry) -> FloatArray:
-    """PSF of the drizzled image of a camera and geometry, computed once per process."""
+def image_psf(camera: Camera, geometry: Geometry, coarse: int = 1) -> FloatArray:
+    """PSF of the drizzled image of a camera and geometry as it is :func:`known <known_psf>`, once per process."""
     field = geometry.drizzled_shape[0] * geometry.drizzled_scale
     radius = math.floor(min(_PSF_REACH, _PSF_FIELD_SHARE * field) / geometry.drizzled_scale)
-    psf = optical_psf(camera, geometry.oversampling)
+    psf = known_psf(camera, geometry.oversampling, coarse)
     return drizzled_psf(psf, geometry, detector_kernel(camera), radius)
 
 
@@ -139,7 +135,7 @@ def combine(scene: Scene, exposures: Exposures, provenance: Provenance | None = 
     return Observation(
         image=drizzle(exposures.noisy, geometry),
         noise=np.sqrt(covariance.diagonal()).reshape(geometry.drizzled_shape),
-        psf=image_psf(scene.camera, geometry),
+        psf=image_psf(scene.camera, geometry, scene.optics.coarse),
         pixel_scale=geometry.drizzled_scale,
         zero_point=scene.camera.zero_point,
         covariance=covariance,
@@ -147,7 +143,10 @@ def combine(scene: Scene, exposures: Exposures, provenance: Provenance | None = 
         provenance={**_exposure_record(scene, exposures), **(provenance or {})},
         centre=scene.system.coordinates,
         response=ExposedOptics(
-            optical_psf(scene.camera, geometry.oversampling), geometry, detector_kernel(scene.camera)
+            known_psf(scene.camera, geometry.oversampling, scene.optics.coarse),
+            geometry,
+            detector_kernel(scene.camera),
+            camera=scene.camera,
         ),
     )
 
@@ -172,6 +171,10 @@ def _exposure_record(scene: Scene, exposures: Exposures) -> dict[str, str | floa
         "N_SATUR": int(np.count_nonzero(noise.saturated)),
         "DEFOCUS": scene.optics.defocus_nm,
         "JITTER": scene.optics.jitter,
+        "COLOUR": scene.optics.colour,
+        "RESIDUAL": scene.optics.residual,
+        "RES_SEED": scene.optics.residual_seed,
+        "COARSE": scene.optics.coarse,
     }
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, SerializerFunctionWrapHandler, Tag, model_serializer, model_validator
 from pydantic.dataclasses import dataclass
 
 from engine.errors import SpecError
@@ -23,7 +23,7 @@ from engine.spec.quantities import (
     Scale,
     Shift,
 )
-from engine.spec.validation import NAME_TAG, OBJECT_TAG, name_or_object
+from engine.spec.validation import LIST_TAG, NAME_TAG, OBJECT_TAG, name_or_object, one_or_list
 
 PupilCoordinate = Annotated[Number, Field(ge=-2.0, le=2.0), UNSIGNED]
 Waves = Annotated[Number, Field(ge=-10.0, le=10.0), UNSIGNED]
@@ -140,14 +140,51 @@ CameraChoice = Annotated[
 
 @dataclass(frozen=True, config=STRICT)
 class Optics:
-    """How the telescope departs from its nominal PSF, for simulating a PSF that the analysis does not know.
+    """How the PSF of the sky departs from the one that the analysis is given.
 
     ``defocus_nm`` is the focus error [nm rms of wavefront]; 1 micron of HST's secondary mirror is 6 nm, its breathing
-    about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis].
+    about 15 nm. ``jitter`` is the pointing jitter [arcsec rms an axis]. ``colour`` is how much bluer than the star of
+    the analysis's PSF the sky is: its photons per nm go as wavelength^-colour beside the star's. ``residual`` is a
+    smooth random error of the PSF, rms as a part of its light, drawn by ``residual_seed``. ``coarse`` is the side
+    [sub-pixels of the simulation] of the pixels on which the analysis knows its PSF: it is the mean over them.
     """
 
     defocus_nm: Annotated[Number, Field(ge=-500.0, le=500.0), UNSIGNED] = 0.0
     jitter: Annotated[Number, Field(ge=0.0, le=0.5), UNSIGNED] = 0.0
+    colour: Annotated[Number, Field(ge=-20.0, le=20.0), UNSIGNED] = 0.0
+    residual: Annotated[Number, Field(ge=0.0, le=0.2), UNSIGNED] = 0.0
+    residual_seed: Annotated[Count, Field(ge=0, le=2**32 - 1)] = 0
+    coarse: Annotated[Count, Field(ge=1, le=12)] = 1
+
+    @property
+    def label(self) -> str:
+        """What tells it apart, in short: ``d20_j0.005``; ``nominal`` where nothing is spoilt."""
+        parts = (
+            f"{letter}{getattr(self, name):g}"
+            for letter, name in _LETTERS.items()
+            if getattr(self, name) != getattr(NOMINAL_OPTICS, name)
+        )
+        return "_".join(parts) or "nominal"
+
+    @model_serializer(mode="wrap")
+    def _without_what_came_later(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """As it was before there were more than two fields, where the others are not used: digests and keys stay."""
+        document: dict[str, Any] = handler(self)
+        later = ("colour", "residual", "residual_seed", "coarse")
+        return {
+            name: value
+            for name, value in document.items()
+            if name not in later or value != getattr(NOMINAL_OPTICS, name)
+        }
 
 
+_LETTERS = {
+    "d": "defocus_nm", "j": "jitter", "c": "colour", "r": "residual", "s": "residual_seed", "k": "coarse"
+}  # fmt: skip
+OpticsChoice = Annotated[
+    Annotated[Optics, Tag(OBJECT_TAG)]
+    | Annotated[tuple[Optics, ...], Field(min_length=1, max_length=100), Tag(LIST_TAG)],
+    Discriminator(one_or_list),
+]
+"""One way in which the PSF is spoilt, or several."""
 NOMINAL_OPTICS = Optics()

@@ -117,6 +117,11 @@ def camera_from_mapping(document: Mapping[str, Any]) -> Camera:
     return _read(_CAMERA, document)
 
 
+def camera_to_mapping(camera: Camera) -> dict[str, Any]:
+    """JSON-ready form of a camera; :func:`camera_from_mapping` reads it back."""
+    return dict(_CAMERA.dump_python(camera, mode="json"))
+
+
 def _read(adapter: TypeAdapter[_Read], document: Mapping[str, Any]) -> _Read:
     try:
         return adapter.validate_python(document)

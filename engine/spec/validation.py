@@ -16,6 +16,7 @@ from engine.errors import SpecError, shown
 
 NAME_TAG = "<name>"
 OBJECT_TAG = "<object>"
+LIST_TAG = "<list>"
 IDENTIFIER = r"^[A-Za-z0-9][A-Za-z0-9+._/-]*$"
 DECIMAL = r"^[0-9]{1,2}(\.[0-9]{1,20})?$"
 PRINTABLE = (
@@ -32,7 +33,7 @@ _PATTERNS = {
 _SIMPLE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 # A step of a path as field_path writes it: [index], ["any key"] in JSON's quotes, or a name.
 _STEP = re.compile(r'\[(\d+)\]|\[("(?:[^"\\]|\\.)*")\]|\.?([A-Za-z_][A-Za-z0-9_]*)')
-_CHOICES = frozenset({"system", "camera", "dither"})
+_CHOICES = frozenset({"system", "camera", "dither", "optics"})
 
 # What is allowed, by pydantic's error type; the values in braces are those of its context.
 _ALLOWED = {
@@ -72,6 +73,11 @@ def name_or_object(value: object) -> str:
     return NAME_TAG if isinstance(value, str) else OBJECT_TAG
 
 
+def one_or_list(value: object) -> str:
+    """Which half of a union is meant by a value: a list of objects, or one of them."""
+    return LIST_TAG if isinstance(value, list | tuple) else OBJECT_TAG
+
+
 def field_path(steps: Sequence[int | str]) -> str:
     """Steps as people write them: ``agn[1].magnitude``, ``mass_models.recommended["1.0"].q``."""
     path = ""
@@ -95,7 +101,7 @@ def _field_steps(error: Any) -> tuple[int | str, ...]:
     steps: list[int | str] = []
     location = error["loc"]
     for before, step in zip((None, *location), location, strict=False):
-        tag = step in {NAME_TAG, OBJECT_TAG} and (isinstance(before, int) or before in _CHOICES)
+        tag = step in {NAME_TAG, OBJECT_TAG, LIST_TAG} and (isinstance(before, int) or before in _CHOICES)
         if not tag:
             steps.append(step)
     if steps and steps[-1] == "[key]" and error["type"] not in {"extra_forbidden", "unexpected_keyword_argument"}:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from http import HTTPStatus
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +16,8 @@ from service.cli.request_file import named_or_read, read_request
 from service.cli.sky import DeflectorOption, HostImageOption, HostOption, deflectors_asked, hosts_asked
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from service.client import Client
     from service.domain.answers import SummaryAnswer
     from service.domain.views import GridView
@@ -70,8 +73,20 @@ def submit(
     camera: Annotated[str | None, typer.Option(help="Instead of the systems': a name, or a TOML or JSON file")] = None,
     mass_model: Annotated[str | None, typer.Option(help="recommended without, or another of the systems")] = None,
     noise_level: Annotated[str | None, typer.Option(help="author without (the paper's scripts), or handbook")] = None,
-    defocus_nm: Annotated[float | None, typer.Option(help="Focus error of the telescope, nm rms of wavefront")] = None,
-    jitter: Annotated[float | None, typer.Option(help="Pointing jitter, arcsec rms an axis")] = None,
+    defocus_nm: Annotated[
+        list[float] | None, typer.Option(help="Focus error of the telescope, nm rms of wavefront; an axis if repeated")
+    ] = None,
+    jitter: Annotated[list[float] | None, typer.Option(help="Pointing jitter, arcsec rms an axis")] = None,
+    colour: Annotated[
+        list[float] | None, typer.Option(help="How much bluer the sky is than the star of the PSF: slope of photons")
+    ] = None,
+    residual: Annotated[
+        list[float] | None, typer.Option(help="Smooth random error of the PSF, rms as a part of its light")
+    ] = None,
+    residual_seed: Annotated[list[int] | None, typer.Option(help="Of the random error")] = None,
+    coarse: Annotated[
+        list[int] | None, typer.Option(help="Sub-pixels a side on which the analysis knows the PSF")
+    ] = None,
     profile: Annotated[str | None, typer.Option(help="Of the analysis: draft, standard, reference or paper")] = None,
     estimator: Annotated[
         list[str] | None, typer.Option(help="Whose answer is wanted, as image, which takes seconds; all without")
@@ -99,7 +114,10 @@ def submit(
     request |= {option: value for option, value in options.items() if value not in (None, [])}
     rule = {"estimator": until_estimator, "at_least": at_least, "at_most": at_most}
     _change(request, "until", {**_error_of(until), **rule})
-    _change(request, "optics", {"defocus_nm": defocus_nm, "jitter": jitter})
+    _spoil(
+        request, defocus_nm=defocus_nm, jitter=jitter, colour=colour, residual=residual, residual_seed=residual_seed,
+        coarse=coarse,
+    )  # fmt: skip
     _change(request, "analysis", {**_fields(analysis), "profile": profile, "estimators": estimator or None})
     with connected(url, token) as client:
         if dry_run:
@@ -277,6 +295,16 @@ def _change(request: dict[str, Any], part: str, given: dict[str, Any]) -> None:
     if given:
         before = request.get(part)
         request[part] = {**(before if isinstance(before, dict) else {}), **given}
+
+
+def _spoil(request: dict[str, Any], **given: Sequence[float] | None) -> None:
+    """Put optics into a request: an object, or a list of every combination where a value is given more than once."""
+    named = {name: values for name, values in given.items() if values}
+    several = [dict(zip(named, values, strict=True)) for values in product(*named.values())]
+    if len(several) > 1:
+        request["optics"] = several
+    else:
+        _change(request, "optics", several[0])
 
 
 def filters(where: list[str] | None) -> dict[str, Any]:

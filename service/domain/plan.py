@@ -9,6 +9,9 @@ from typing import Any, NamedTuple, Protocol
 IMAGE = "image"
 """Kind of a run that measures an uploaded image."""
 
+OPTICS_AXES = {"defocus_nm": 0.0, "jitter": 0.0, "colour": 0.0, "residual": 0.0, "coarse": 1}
+"""What answers are grouped by of how a PSF is spoilt, and what it is where nothing is."""
+
 
 class Kind(NamedTuple):
     """What the time that a run takes depends on most."""

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, StringConstraints, create_model
 
 import engine
 from engine import (
+    NOMINAL_OPTICS,
     PRINTABLE,
     USUAL_DEFLECTOR,
     Analysis,
@@ -31,7 +32,7 @@ from engine import (
     LensSystem,
     Magnitudes,
     NoiseLevel,
-    Optics,
+    OpticsChoice,
     Radii,
     Realization,
     Replicates,
@@ -47,7 +48,7 @@ from engine import (
     system_facts,
     system_names,
 )
-from service.domain.plan import Kind, PlannedRun
+from service.domain.plan import OPTICS_AXES, Kind, PlannedRun
 from service.domain.precision import Until
 from service.domain.views import CameraItem, EngineView, SystemItem, SystemView
 
@@ -78,8 +79,8 @@ class GridRequest(BaseModel):
     lists are needed, and every combination is run. A system is a name of the catalogue or an object of one's own, and
     so is ``camera``, which takes the place of the systems' own. ``hosts`` are galaxies beside, or in the place of, the
     Sersic profiles of the indices ``n``; ``deflectors`` what the lenses have beside their own light and mass, {} being
-    nothing. ``replicates`` repeats each point with seeds seed, seed + 1, ...; with ``until`` instead each point is
-    repeated until its mean bias is known to an error.
+    nothing; ``optics``, one or several, spoil the PSF of the sky. ``replicates`` repeats each point with seeds seed,
+    seed + 1, ...; with ``until`` instead each point is repeated until its mean bias is known to an error.
     """
 
     model_config = _CONFIG
@@ -95,7 +96,7 @@ class GridRequest(BaseModel):
     deflectors: Deflectors | None = None
     noise_level: NoiseLevel = "author"
     mass_model: Identifier = "recommended"
-    optics: Optics | None = None
+    optics: OpticsChoice | None = None
     camera: CameraChoice | None = None
     seed: FirstSeed = 0
     replicates: Replicates = 1
@@ -166,7 +167,8 @@ def plan(request: GridRequest, max_runs: int) -> Plan:
     lists = (request.systems, request.r_eff, request.magnitude, request.l_eta)
     if request.preset is None:
         shapes = len(request.n or ()) + len(request.hosts or ())
-        each = shapes * len(request.deflectors or (None,)) * request.most_replicates
+        spoilt = len(request.optics) if isinstance(request.optics, tuple) else 1
+        each = shapes * spoilt * len(request.deflectors or (None,)) * request.most_replicates
         _limit(math.prod(len(values or ()) for values in lists) * each, max_runs)
     _check_own_systems(request)
     runs = Expansion(_grid(request))
@@ -269,6 +271,7 @@ def _planned(run: GridRun) -> PlannedRun:
         "host_kind": realization.host.kind,
         "host_label": realization.host.label,
         "deflector": USUAL_DEFLECTOR if realization.deflector is None else realization.deflector.label,
+        **{name: getattr(realization.optics or NOMINAL_OPTICS, name) for name in OPTICS_AXES},
         "seed": realization.seed,
     }
     spec = realization.to_dict()

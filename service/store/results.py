@@ -39,7 +39,8 @@ _PARTS = tuple((quantity, *(f"{quantity}_{part}" for part in ("mean", "sd", "bia
 def result_row(lease: Lease, inputs: Mapping[str, Any], payload: ResultPayload, now: datetime) -> dict[str, Any]:
     """Typed columns of a result but for ``input_id``; ``inputs`` are those of the run."""
     row: dict[str, Any] = {"run_id": lease.run_id, "grid_id": lease.grid_id, "stored_at": now}
-    known = {**USUAL_INPUTS, **inputs}
+    # Runs that were queued before optics were inputs have them in their specification.
+    known = {**USUAL_INPUTS, **(lease.spec.get("optics") or {}), **inputs}
     row |= {name: known[name] for name in (*INPUT_COLUMNS, "configuration")}
     row["observation_digest"] = observation_digest(lease.spec)
     row |= found_columns(payload)

@@ -29,8 +29,9 @@ from sqlalchemy import (
 from sqlalchemy.types import TypeEngine
 
 from service.domain.payload import COUNTS, ERRORS, LENS_PARAMETERS, QUANTITIES, WORK
+from service.domain.plan import OPTICS_AXES
 
-REVISION = "0013"
+REVISION = "0014"
 """Revision of the migrations that these tables are."""
 
 metadata = MetaData(
@@ -189,9 +190,9 @@ Index(
 
 INPUT_COLUMNS = (
     "system", "camera", "mass_model", "noise_level", "noise_treatment",
-    "l_eta", "n", "r_eff", "magnitude", "host_kind", "host_label", "deflector", "seed",
+    "l_eta", "n", "r_eff", "magnitude", "host_kind", "host_label", "deflector", *OPTICS_AXES, "seed",
 )  # fmt: skip
-USUAL_INPUTS = {"host_kind": "sersic", "host_label": "sersic", "deflector": "plain"}
+USUAL_INPUTS: dict[str, Any] = {"host_kind": "sersic", "host_label": "sersic", "deflector": "plain", **OPTICS_AXES}
 """Of runs from before there was anything else, whose inputs do not name these."""
 
 
@@ -202,10 +203,12 @@ def _input_columns() -> list[Column[Any]]:
         "r_eff": Float(),
         "magnitude": Float(),
     }
+    types |= dict.fromkeys(OPTICS_AXES, Float())
     types["seed"] = BigInteger()
+    usual = {name: str(value) for name, value in USUAL_INPUTS.items()}
     # A host that is no Sersic profile has no index.
     return [
-        Column(name, types.get(name, String(64)), nullable=name == "n", server_default=USUAL_INPUTS.get(name))
+        Column(name, types.get(name, String(64)), nullable=name == "n", server_default=usual.get(name))
         for name in INPUT_COLUMNS
     ]
 

@@ -31,6 +31,7 @@ def bare_fit(lens: PowerLawLens, host: SersicProfile, shape: tuple[int, int]) ->
         arc=np.zeros(shape),
         sigma=np.full(shape, np.inf),
         psf=np.ones((1, 1)),
+        response=None,
         error=None,
         chi2=0.0,
         degrees_of_freedom=1,

@@ -16,7 +16,7 @@ from tests.sources import parsed
 HERE = Path(__file__).parent
 PAGE = HERE.parents[1] / "docs" / "reference" / "hard-cases.md"
 ORDER = (
-    "lenses", "light", "inversions", "components", "coincidences", "precision", "chains", "hosts", "size",
+    "lenses", "light", "inversions", "components", "optics", "coincidences", "precision", "chains", "hosts", "size",
     "no_sentinels",
 )  # fmt: skip
 RISK, PROMISE = "Could go wrong:", "Holds:"

@@ -36,7 +36,10 @@ WHOLE: dict[str, Any] = {
     "systems": [{**OWN, "camera": "WFC3-IR_F160W", "priors": {"q": {"low": 0.5, "high": 1.0, "mean": 0.8, "sd": 0.1}}}],
     "n": [2.0], "r_eff": [0.35], "magnitude": [21.0], "l_eta": [1.0],
     "noise_level": "author", "mass_model": "recommended", "camera": CAMERA,
-    "optics": {"defocus_nm": 5.0, "jitter": 0.01}, "seed": 3, "replicates": 2,
+    "optics": {
+        "defocus_nm": 5.0, "jitter": 0.01, "colour": 1.0, "residual": 0.01, "residual_seed": 4, "coarse": 2
+    },
+    "seed": 3, "replicates": 2,
     "analysis": {
         "profile": "draft", "source_pixels": [20, 20], "regularisation": "gradient",
         "noise_treatment": "diagonal", "mask_inner": 0.4, "mask_outer": 1.6,

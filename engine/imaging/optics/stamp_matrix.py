@@ -15,6 +15,8 @@ from engine.conventions import FloatArray
 from engine.errors import ObservationError
 from engine.imaging.optics.interface import Pixels
 
+_NO_LIGHT = 1e-6
+
 
 def _average_transfer(frequencies: FloatArray, subrays: int | None) -> FloatArray:
     """Transfer function of the mean over ``subrays`` points of a pixel (None: over the whole pixel)."""
@@ -27,7 +29,8 @@ def _average_transfer(frequencies: FloatArray, subrays: int | None) -> FloatArra
 def pixel_kernel(psf: FloatArray, subrays: int | None) -> FloatArray:
     """The PSF for fluxes that are means over ``subrays`` x ``subrays`` points of a pixel, or integrals (None).
 
-    Same shape as ``psf`` (odd by odd). The result has the PSF's sum.
+    Same shape as ``psf`` (odd by odd). The result has the PSF's sum; a correction of a PSF makes no light, and has none
+    to keep.
     """
     ny, nx = psf.shape
     if ny % 2 == 0 or nx % 2 == 0:
@@ -41,6 +44,8 @@ def pixel_kernel(psf: FloatArray, subrays: int | None) -> FloatArray:
         _average_transfer(fft.rfftfreq(padded.shape[1]), subrays),
     )
     kernel = fft.irfft2(fft.rfft2(padded) / transfer, s=padded.shape)[pad:-pad, pad:-pad]
+    if abs(psf.sum()) < _NO_LIGHT * np.abs(psf).sum():
+        return np.asarray(kernel)
     return np.asarray(kernel * (psf.sum() / kernel.sum()))
 
 
