@@ -32,14 +32,13 @@ from engine import (
     system_names,
 )
 from engine.accuracy.curves import Point
-from engine.accuracy.peers import effective_brightness
 from engine.accuracy.rendering import INTEGRATION, PEER_SUBPIXELS, HostImage, uniform
 from engine.accuracy.report import accuracy_knobs
 from engine.accuracy.subject import Subject
 from engine.conventions import FloatArray
 from engine.figures import accuracy_figure, figure_bytes
 from engine.lensing.power_law import PowerLawLens, deflection
-from engine.light.sersic import SersicProfile
+from engine.light.sersic import SersicProfile, effective_brightness
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, DATA = DOCS / "tables" / "speed_against_error.md", DOCS / "tables" / "speed_against_error.json"

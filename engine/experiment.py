@@ -11,6 +11,7 @@ from engine.acceptance import check_realization
 from engine.catalogue import resolve_system
 from engine.comparison import compare, view_beside
 from engine.inspection import InversionView, inspect_inversion
+from engine.parametric.search import Acceptance
 from engine.reconstruction import analyse
 from engine.result import RunResult
 from engine.simulation.seeds import generator
@@ -22,6 +23,8 @@ from engine.work import counted
 
 _ANALYSIS = 1
 """The purpose of the random generator of chain and draws."""
+_ANY_HOST = Acceptance(chi2_per_dof=300.0, miss=0.3)
+"""No galaxy is a Sersic profile: what describes one poorly is told as such, with the error that it makes."""
 
 
 def analysis_of(realization: Realization) -> Analysis:
@@ -59,6 +62,7 @@ def run(realization: Realization, progress: Progress | None = None) -> RunResult
         agn_images=len(scene.agn),
         deflector=scene.deflector is not None,
         shear=scene.lens.sheared,
+        acceptance=_ANY_HOST,
         fixed_index=scene.host.n,
         progress=progress,
     )

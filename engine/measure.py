@@ -24,15 +24,16 @@ from engine.neighbours import without_lone_pixels, without_neighbours
 from engine.on_sky import lens_on_sky, orientation_document, places_on_sky, turned
 from engine.parametric.constraints import GALAXY, WIDE
 from engine.parametric.fit import ParametricFit
+from engine.parametric.poor_fit import POOR_FIT, widened
 from engine.parametric.residual_noise import noise_scale
 from engine.parametric.search import Acceptance
 from engine.plausibility import require_hints, require_lens, unlikely
-from engine.reconstruction import POOR_FIT, SampledInversion, analyse, lens_of_fit, of_model, poor_fit, undetected
+from engine.reconstruction import SampledInversion, analyse, lens_of_fit, of_model, poor_fit, undetected
 from engine.result import Estimate, LensParameter, Quantity
 from engine.several_psfs import PsfFit, averaged
 from engine.spec.analysis import PROFILES, Analysis
 from engine.stages import Progress
-from engine.status import MeasurementStatus, arc_misfit, magnitude_limit, not_detected, prior_dominated, status_of
+from engine.status import MeasurementStatus, magnitude_limit, not_detected, prior_dominated, status_of
 from engine.work import Work, counted
 
 _ANY_LENS = Acceptance(chi2_per_dof=300.0, miss=0.3)
@@ -327,7 +328,7 @@ def measure_image(
     inflation = max(1.0, scale)
     posterior = fit.hosts["wide"].inflated(inflation)
     if chi2 > POOR_FIT:
-        posterior = posterior.blurred(arc_misfit(observation, fit))
+        posterior = widened(observation, fit, posterior)
     host = turned(image_estimate(posterior, "wide", observation.zero_point), orientation)
     drawn = () if found.inversion is None else found.inversion.estimates
     warnings += [] if found.inversion is None else found.inversion.warnings

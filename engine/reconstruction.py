@@ -29,6 +29,7 @@ from engine.imaging.telescope import NOMINAL_STATE
 from engine.likelihood.evidence import Inversion
 from engine.likelihood.problem import Problem, prepare_problem
 from engine.parametric.fit import GOOD_START, Acceptance, ParametricFit, fit_parametric
+from engine.parametric.poor_fit import POOR_FIT, widened
 from engine.posterior.chain import Chain, run_chain
 from engine.posterior.optimum import find_optimum
 from engine.posterior.start import find_start, prepare_target
@@ -48,8 +49,6 @@ from engine.spec.analysis import Analysis
 from engine.stages import Progress, Stopwatch
 from engine.work import Work, counted
 
-POOR_FIT = 1.5
-"""chi^2 per degree of freedom from which on it is said that the model does not describe the image."""
 DETECTED = 3.0
 """Flux of a host in its own errors below which it is said that none was detected."""
 _BRIGHT_SIDE = 1.645
@@ -172,12 +171,14 @@ def analyse(
         inversion = _sampled(observation, fit, analysis, rng, fixed_index, watch) if analysis.needs_chain else None
     estimates, warnings = ((), ()) if inversion is None else (inversion.estimates, inversion.warnings)
     if "image" in analysis.estimators:
+        poor = fit.misfit > POOR_FIT
+        hosts = {prior: widened(observation, fit, host) if poor else host for prior, host in fit.hosts.items()}
         missing = [prior for prior in _priors(fixed_index) if prior not in fit.hosts]
         warnings += tuple(f"image estimator, n {prior}: no fit has a positive host" for prior in missing)
         estimates += tuple(
-            with_image_budget(image_estimate(fit.hosts[prior], prior, observation.zero_point), fit.shifts.get(prior))
+            with_image_budget(image_estimate(hosts[prior], prior, observation.zero_point), fit.shifts.get(prior))
             for prior in _priors(fixed_index)
-            if prior in fit.hosts
+            if prior in hosts
         )
     if analysis.max_error is not None:
         warnings += not_kept(estimates, analysis.max_error)
@@ -187,7 +188,12 @@ def analyse(
     told = [
         *warnings,
         *of_model(fit),
-        *(undetected(one) for one in estimates if one.estimator == "image" and one.index_prior == "wide"),
+        # Of a poor fit the error is that of the model, and says nothing of whether there is a host.
+        *(
+            undetected(one)
+            for one in estimates
+            if fit.misfit <= POOR_FIT and one.estimator == "image" and one.index_prior == "wide"
+        ),
     ]
     told.append(poor_fit(found.chi2 / found.degrees_of_freedom))
     return replace(found, warnings=tuple(filter(None, told)))

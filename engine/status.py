@@ -6,24 +6,17 @@ import math
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import ndimage
 
-from engine.conventions import FloatArray
-from engine.imaging.observation import Observation
 from engine.parametric.fit import ParametricFit
 from engine.parametric.host_posterior import COORDINATES
-from engine.reconstruction import POOR_FIT, brightest_limit, undetected
+from engine.parametric.poor_fit import POOR_FIT
+from engine.reconstruction import brightest_limit, undetected
 from engine.result import Estimate
 
 MeasurementStatus = Literal["ok", "poor_fit", "not_detected", "prior_dominated"]
 _ARC_SEEN = 25.0
 """Signal-to-noise of all of an arc from which on it is there, however little is known of its host's light: the noise
 alone, fitted by any host, comes to five to twelve."""
-_ARC_SHARE = 0.25
-"""Part of the arc's brightest pixel from which on a pixel is one of the arcs."""
-_STRUCTURE = 1.5
-"""Pixels over which residuals are smoothed that are to be structure and not noise."""
 _PRIOR_WIDTHS = {"ln_r_eff": 1.3, "n": 2.2}
 """Standard deviations of the host's parameters that its bounds alone would give, nearly."""
 
@@ -60,21 +53,3 @@ def prior_dominated(fit: ParametricFit) -> tuple[str, ...]:
 def magnitude_limit(fit: ParametricFit, host: Estimate) -> float | None:
     """The magnitude that a host which is not detected is fainter than (95 %); None for one that is."""
     return brightest_limit(host) if not_detected(fit, host) else None
-
-
-def arc_misfit(observation: Observation, fit: ParametricFit) -> float:
-    """Light that the model misses among the arcs, as a part of theirs: the error of a flux that no noise map has."""
-    counted = np.isfinite(fit.sigma)
-    among = counted & (fit.arc > _ARC_SHARE * float(fit.arc[counted].max(initial=0.0)))
-    total = float(fit.arc[among].sum())
-    if not total > 0:
-        return 0.0
-    residual = np.where(counted, observation.image - fit.model, 0.0)
-    missed = _structure(residual, among)
-    noise = _structure(fit.sigma, among) / math.sqrt(4.0 * math.pi * _STRUCTURE**2) * math.sqrt(2.0 / math.pi)
-    return math.sqrt(max(missed**2 - noise**2, 0.0)) / total
-
-
-def _structure(values: FloatArray, among: NDArray[np.bool_]) -> float:
-    smooth = ndimage.gaussian_filter(np.where(np.isfinite(values), values, 0.0), _STRUCTURE)
-    return float(np.abs(smooth[among]).sum())

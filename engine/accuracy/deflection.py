@@ -9,6 +9,7 @@ from engine.accuracy import peers
 from engine.accuracy.curves import Curve, Knob, Point
 from engine.accuracy.subject import Subject
 from engine.accuracy.timing import Measuring, least_cpu
+from engine.codes.installed import installed
 from engine.conventions import FloatArray
 from engine.lensing.power_law import (
     SERIES_TOLERANCE,
@@ -83,7 +84,7 @@ def measure(subject: Subject) -> list[Curve]:
             return cost, error(x - bx, y - by)
 
         found.add(f"{tolerance:.0e}", one, default=tolerance == SERIES_TOLERANCE)
-    if peers.installed("lenstronomy"):
+    if installed("lenstronomy"):
         for profile in ("EPL_NUMBA", "EPL"):
             work = peers.lenstronomy_deflection(lens, profile, x, y)
             found.add_peers([Point(profile, least_cpu(work), error(*work()), peer="lenstronomy")])

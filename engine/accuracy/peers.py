@@ -5,27 +5,13 @@ lenstronomy is no dependency of hostlens: it is imported when its points are wan
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from engine.conventions import FloatArray
 from engine.lensing.power_law import PowerLawLens
-from engine.light.sersic import SersicProfile, sersic_k, sersic_normalisation
-
-PEERS = {"lenstronomy": "lenstronomy", "PyAutoLens": "autolens"}
-"""Names, and the modules that they are imported by."""
-
-
-def installed(peer: str) -> bool:
-    """Whether a peer can be imported here."""
-    return find_spec(PEERS[peer]) is not None
-
-
-def effective_brightness(profile: SersicProfile) -> float:
-    """Surface brightness at the half-light radius, for unit flux [arcsec^-2]."""
-    return sersic_normalisation(profile.n, profile.r_eff) * float(np.exp(-sersic_k(profile.n)))
+from engine.light.sersic import SersicProfile, effective_brightness
 
 
 def _ellipticity(phi: float, q: float) -> dict[str, float]:

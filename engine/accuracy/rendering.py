@@ -12,6 +12,7 @@ from engine.accuracy.curves import Curve, Knob, Point
 from engine.accuracy.light_reference import graded_fluxes
 from engine.accuracy.subject import Subject
 from engine.accuracy.timing import Measuring, least_cpu
+from engine.codes.installed import installed
 from engine.conventions import FloatArray
 from engine.imaging.convolution import convolve
 from engine.imaging.drizzling import drizzle
@@ -97,7 +98,7 @@ def measure(subject: Subject) -> list[Curve]:
         found.add(
             f"even rays {subpixels} x {subpixels}", partial(one, partial(uniform, host, lens, x, y, scale, subpixels))
         )
-    if peers.installed("lenstronomy"):
+    if installed("lenstronomy"):
         for subpixels in PEER_SUBPIXELS:
             cost, error = one(peers.lenstronomy_image(host, lens, x, y, scale, subpixels))
             found.add_peers([Point(f"{subpixels} x {subpixels}", cost, error, peer="lenstronomy")])

@@ -8,9 +8,10 @@ from types import ModuleType
 
 from threadpoolctl import threadpool_limits
 
-from engine.accuracy import cusps, deflection, draws, drizzling, noise, peers, psf, rendering, sampling, source
+from engine.accuracy import cusps, deflection, draws, drizzling, noise, psf, rendering, sampling, source
 from engine.accuracy.curves import AccuracyReport, Curve, Knob, Point, Refusal, by_knob
 from engine.accuracy.subject import Subject
+from engine.codes.installed import PEERS, installed
 from engine.errors import EngineError, SpecError
 from engine.spec.realization import Realization
 from engine.stages import ACCURACY_STAGES
@@ -69,7 +70,7 @@ def measure_accuracy(
         system=realization.system_name,
         scene=subject.told,
         curves=tuple(curves),
-        absent=tuple(peer for peer in peers.PEERS if not peers.installed(peer)),
+        absent=tuple(peer for peer in PEERS if not installed(peer)),
         refused=tuple(Refusal(stage, str(error)) for stage, error in errors.items()),
     )
 

@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from engine.accuracy.peers import effective_brightness
 from engine.codes.answer import CodeAnswer
 from engine.codes.joint_fit import Task, fitted
 from engine.conventions import FloatArray
 from engine.errors import EngineError
 from engine.imaging.optics.stamp import StampOptics
 from engine.lensing.power_law import PowerLawLens, deflection
-from engine.light.sersic import SersicProfile, profile_of
+from engine.light.sersic import SersicProfile, effective_brightness, profile_of
 from engine.parametric.parameters import ParameterSpace
 from engine.stages import Progress
 

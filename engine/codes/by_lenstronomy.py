@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from engine.accuracy.peers import effective_brightness
 from engine.codes.answer import CodeAnswer
 from engine.codes.joint_fit import Task, fitted
 from engine.conventions import FloatArray, pixel_centres
-from engine.light.sersic import profile_of
+from engine.light.sersic import effective_brightness, profile_of
 from engine.parametric.parameters import ParameterSpace
 from engine.stages import Progress
 

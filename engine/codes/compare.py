@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from engine.accuracy.peers import PEERS, installed
 from engine.codes.answer import CodeAnswer
 from engine.codes.by_autolens import fit_with_autolens
 from engine.codes.by_lenstronomy import fit_with_lenstronomy
+from engine.codes.installed import PEERS, installed
 from engine.codes.joint_fit import Task
 from engine.errors import EngineError
 from engine.measure import ImageMeasurement

@@ -17,13 +17,12 @@ from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 
-from engine.accuracy.peers import effective_brightness
 from engine.codes.answer import CodeAnswer
 from engine.codes.joint_fit import Task
 from engine.conventions import FloatArray, position_angle
 from engine.imaging.observation import Observation
 from engine.lensing.power_law import PowerLawLens
-from engine.light.sersic import SersicProfile
+from engine.light.sersic import SersicProfile, effective_brightness
 
 _REDSHIFTS = (0.5, 1.5)
 """Of deflector and host; nothing in a model of an image depends on them."""

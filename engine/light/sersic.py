@@ -136,3 +136,8 @@ def flux_in_circle(profile: SersicProfile, radius: float) -> float:
     g2 = profile.q * np.cos(t) ** 2 + np.sin(t) ** 2 / profile.q
     inner = sersic_k(profile.n) * (g2 * (radius / profile.r_eff) ** 2) ** (0.5 / profile.n)
     return profile.flux * float((gammainc(2.0 * profile.n, inner) / g2).mean())
+
+
+def effective_brightness(profile: SersicProfile) -> float:
+    """Surface brightness at the half-light radius, for unit flux [arcsec^-2]."""
+    return sersic_normalisation(profile.n, profile.r_eff) * float(np.exp(-sersic_k(profile.n)))

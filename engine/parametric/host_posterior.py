@@ -40,12 +40,6 @@ class HostPosterior:
         lower[_N], upper[_N] = low, high
         return replace(self, low=lower, high=upper)
 
-    def blurred(self, fraction: float) -> HostPosterior:
-        """The same with a flux that is unknown by that part of it besides."""
-        wider = self.covariance.copy()
-        wider[0, 0] += fraction**2
-        return replace(self, covariance=wider)
-
     def inflated(self, factor: float) -> HostPosterior:
         """The same with standard deviations that are ``factor`` times as large."""
         return replace(self, covariance=factor**2 * self.covariance)

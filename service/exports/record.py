@@ -9,6 +9,7 @@ from sqlalchemy import Connection
 
 from service import VERSION
 from service.domain.payload import COUNTS, ERRORS, ESTIMATES, QUANTITIES, ResultPayload
+from service.domain.plan import OPTICS_AXES
 from service.exports.contents import stamp
 from service.store.result_filter import ResultFilter
 from service.store.result_rows import ResultColumn, result_columns, result_statement
@@ -17,7 +18,7 @@ from service.store.tables import result
 
 FORMAT = "hostlens record 1"
 _OF_ESTIMATE = (*(f"{quantity}_{part}" for quantity in QUANTITIES for part in ("mean", "sd", "bias")), *COUNTS, *ERRORS)
-_GIVEN = frozenset({"paper_run", "l_eta", "n", "r_eff", "magnitude", "seed", "wall_s", "cpu_s"})
+_GIVEN = frozenset({"paper_run", "l_eta", "n", "r_eff", "magnitude", "seed", "wall_s", "cpu_s", *OPTICS_AXES})
 """Numbers of a result that are no finding."""
 
 

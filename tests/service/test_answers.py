@@ -394,9 +394,9 @@ def test_a_stream_of_rows_begins_after_a_run_and_has_the_types_it_says(stored: S
 @pytest.mark.parametrize(
     ("address", "parameter", "told"),
     [
-        ("/v1/summary?group_by=colour", "group_by", "configuration"),
+        ("/v1/summary?group_by=taste", "group_by", "configuration"),
         ("/v1/summary?group_by=system,system", "group_by", "each once"),
-        ("/v1/summary?colour=red", "colour", "known are"),
+        ("/v1/summary?taste=sweet", "taste", "known are"),
         ("/v1/summary?quantity=colour", "quantity", "magnitude"),
         ("/v1/summary?estimator=colour", "estimator", "image"),
         ("/v1/summary?magnitude=bright", "magnitude", "20..22"),

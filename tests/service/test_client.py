@@ -236,7 +236,10 @@ class TestCommands:
                          "regularisation": "gradient"},
         }  # fmt: skip
         schema = client_schema(client)
-        assert set(request) | {"systems", "preset"} == set(schema["GridRequest"]["properties"])
+        # What goes with none of these has tests of its own: test_until, test_hosts.
+        others = {"until": "--until", "hosts": "--host", "deflectors": "--deflector"}
+        assert set(request) | {"systems", "preset", *others} == set(schema["GridRequest"]["properties"])
+        assert set(others.values()) <= set(hostlens(client, "submit", "--help").split())
         assert "(all of them)" in hostlens(client, "status", grid_id, "--wait")
 
     def test_options_override_a_file(self, client: Client, tmp_path: Path) -> None:

@@ -116,6 +116,7 @@ def plainly(database: Database, grid: GridView, limit: int, offset: int, followi
             SummaryRow(
                 input={name: row._mapping[name] for name in GROUP_COLUMNS},
                 n_runs=row.runs,
+                precision=None,
                 estimates={
                     name: plain_estimate(row._mapping, of_input[row.id].get(estimator_and_prior(name)))
                     for name in ESTIMATES
