@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, inspect, make_url, text
+from sqlalchemy import Connection, inspect, make_url, select, text
 from typer.testing import CliRunner
 
 from service.cli.app import app
@@ -27,7 +28,18 @@ from service.store.migrate import (
     upgrade,
 )
 from service.store.queue import RunQueue, Stored
-from service.store.tables import GROUP_COLUMNS, estimate, grid_moments, input_moments, metadata, result
+from service.store.sums import input_digest
+from service.store.tables import (
+    GROUP_COLUMNS,
+    KEY_COLUMNS,
+    estimate,
+    grid_moments,
+    input_group,
+    input_moments,
+    metadata,
+    result,
+    run,
+)
 from tests.service import history
 from tests.service.conftest import new_database
 from tests.service.plans import result_of, submit, submit_until, until
@@ -294,6 +306,31 @@ def test_what_older_results_did_not_hold_is_null_after_the_upgrade(empties: Empt
         assert (old.r_eff_galfit, old.x, old.y, old.n_at_bound, old.r_eff_at_bound) == (None,) * 5
         assert (found.aperture, found.chain.r_hat, found.profile) == (None, None, None)
         assert found.regularisation == "curvature"
+
+
+def test_results_of_spoilt_optics_say_so_after_the_upgrade(empties: Empties, lived: history.Rows) -> None:
+    url = empties.at("0013")
+    database, before = _filled(url, lived)
+    grid_id = before["input"][0]["grid_id"]
+    request = next(row["request"] for row in lived["grid"] if row["id"] == grid_id)
+    spoilt = json.dumps({**request, "optics": {"defocus_nm": 20, "jitter": 0.004}})
+    with database.write() as connection:
+        asked = text("update grid set request = :request where id = :id")
+        connection.execute(asked, {"request": spoilt, "id": grid_id})
+    upgrade(url)
+    with database.read() as connection:
+        groups = connection.execute(input_group.select()).mappings().all()
+        found = (
+            connection.execute(select(run.c.grid_id, result).join(run, run.c.id == result.c.run_id)).mappings().all()
+        )
+    database.close()
+    assert {row["grid_id"] for row in groups} > {grid_id} or len({row["grid_id"] for row in groups}) == 1
+    for row in (*groups, *found):
+        wanted = (20.0, 0.004) if row["grid_id"] == grid_id else (0.0, 0.0)
+        assert (row["defocus_nm"], row["jitter"], row["coarse"]) == (*wanted, 1.0)
+    for row in groups:
+        # What is stored from now on of the same input finds its row.
+        assert row["digest"] == input_digest(row[name] for name in KEY_COLUMNS)
 
 
 def test_results_that_an_older_revision_cannot_hold_stop_the_downgrade(empties: Empties) -> None:
