@@ -60,6 +60,8 @@ def simulate(
     camera: CameraOption = None,
     defocus_nm: Annotated[float, typer.Option(help="Focus error of the telescope, nm rms of wavefront")] = 0.0,
     jitter: Annotated[float, typer.Option(min=0.0, help="Pointing jitter, arcsec rms an axis")] = 0.0,
+    colour: Annotated[float, typer.Option(help="How much bluer the sky is than the star of the PSF")] = 0.0,
+    residual: Annotated[float, typer.Option(help="Smooth random error of the PSF, part of its light")] = 0.0,
     out: Out = Path(),
     all_runs: Annotated[bool, typer.Option("--all", help="The paper's 48 instead, as a montage")] = False,
 ) -> None:
@@ -67,11 +69,11 @@ def simulate(
     common = {"seed": seed, "noise_level": noise_level, "mass_model": mass_model}
     if all_runs:
         own = (n, host, host_image, r_eff, magnitude, l_eta, deflector)
-        if any(value is not None for value in own) or defocus_nm or jitter:
+        if any(value is not None for value in own) or any((defocus_nm, jitter, colour, residual)):
             raise typer.BadParameter("--all has the hosts, slopes and optics of the paper: leave out --n, --r-eff, ...")
         montage(system, **common, camera=camera, out=out)  # type: ignore[arg-type]
         return
-    optics = {"defocus_nm": defocus_nm, "jitter": jitter} if defocus_nm or jitter else None
+    optics = {"defocus_nm": defocus_nm, "jitter": jitter, "colour": colour, "residual": residual}
     _require_files(system, camera)
     shapes, deflectors = hosts_asked(host, host_image), deflectors_asked(deflector)
     if len(shapes) + (n is not None) > 1 or len(deflectors) > 1:
@@ -82,7 +84,8 @@ def simulate(
             system,
             HostOptions(shape, r_eff, magnitude, _L_ETA if l_eta is None else l_eta),
             camera,
-            common | {"optics": optics, "deflector": deflectors[0] if deflectors else None},
+            common
+            | {"optics": optics if any(optics.values()) else None, "deflector": deflectors[0] if deflectors else None},
         )
         _write_one(realization, out)
 
