@@ -23,7 +23,7 @@ from engine.work import counted
 
 _ANALYSIS = 1
 """The purpose of the random generator of chain and draws."""
-_ANY_HOST = Acceptance(chi2_per_dof=300.0, miss=0.3)
+_ANY_HOST = Acceptance(chi2_per_dof=300.0)
 """No galaxy is a Sersic profile: what describes one poorly is told as such, with the error that it makes."""
 
 
